@@ -49,7 +49,7 @@ const std::vector<FaceDrag>& DragPotential::drags() const {
   return drags_;
 }
 
-/// u.
+/// Velocity u of a face.
 Vec3 DragPotential::velocity(Index f, const double* x) const {
   Vec3 moved = Vec3::Zero();
   for (const Index i : flow_.faces[f]) {
@@ -193,7 +193,7 @@ void DragPotential::swap_cotangents(CotangentStore& store) {
   store.exchange(wind_bar);
 }
 
-/// N = e_1 x e_2: pull its cotangent back to x_n.
+/// Pull the cotangent of N = e_1 x e_2 back to x_n.
 void DragPotential::add_frame_bar(Index f, const Vec3& N_bar) {
   const Face& face = flow_.faces[f];
   const Vec3 first = edge(face, 2, flow_.start).cross(N_bar);
@@ -203,7 +203,7 @@ void DragPotential::add_frame_bar(Index f, const Vec3& N_bar) {
   Eigen::Map<Vec3>(start_bar.data() + 3 * face[2]) += second;
 }
 
-/// The tangent of N.
+/// Tangent of N.
 Vec3 DragPotential::frame_dot(Index f) const {
   const Face& face = flow_.faces[f];
   const double* const dot = start_dot.data();

@@ -19,8 +19,8 @@ struct Flow {
   const double* start = nullptr;       ///< [N, 3] x_n [m]
   Vec3 wind = Vec3::Zero();            ///< w [m/s]
   double h = 0.0;                      ///< time step [s]
-  const double* velocities = nullptr;  ///< [N, 3] v_n, for the mean with them; null: without [m/s]
-  /// Faces with a corner that is no free vertex, if known: add_held_product() takes these alone.
+  const double* velocities = nullptr;  ///< [N, 3] v_n, for the mean velocity, or null [m/s]
+  /// Faces with a corner that is not a free vertex, if known: add_held_product() visits only these.
   const std::vector<Index>* held = nullptr;
 };
 
@@ -28,19 +28,19 @@ struct Flow {
 ///
 ///   P(x) = h sum_f D_f(u_f),    u_f = 1/3 sum_p (x_p - x_n,p) / h - w,
 ///
-/// the sum over the corners p of a face. With given velocities v_n, drag acts on the mean velocity of the step, and is
-/// of second order,
+/// the sum over the corners p of a face. With given velocities v_n, drag acts on the mean velocity of
+/// the step, and is of second order,
 ///
 ///   P(x) = 2 h sum_f D_f(u_f),    u_f = 1/3 sum_p ((x_p - x_n,p) / h + v_n,p) / 2 - w.
 ///
-/// D, see FaceDrag, takes the normal and the area of the face from x_n,
-/// so that P is convex in x. Each corner bears a third of the face's force: together they have the force and
-/// the moment of one at the centroid.
+/// D (see FaceDrag) uses the normal and the area of the face at x_n, so that P is convex in x. Each
+/// corner carries a third of the face's force: together they have the force and the moment of one at the
+/// centroid.
 class DragPotential final : public Potential {
  public:
-  /// @param flow             the arrays that it views outlive the potential
+  /// @param flow             its arrays must outlive the potential
   /// @param vertex_count     N
-  /// @param of_coefficients  whether the cotangents of faces without drag are wanted too
+  /// @param of_coefficients  if true, also compute cotangents of the coefficients of faces without drag
   DragPotential(Flow flow, Index vertex_count, bool of_coefficients);
 
   double energy(const double* x) const override;
@@ -56,7 +56,7 @@ class DragPotential final : public Potential {
   // Cotangents, zero until accumulate(), and tangents, for add_tangent().
   std::vector<double> across_bar, along_bar;  ///< [F]
   std::vector<double> start_bar;              ///< [3 N]
-  std::vector<double> velocity_bar;           ///< [3 N], of v_n; empty without these
+  std::vector<double> velocity_bar;           ///< [3 N], of v_n; empty without velocities
   std::vector<double> wind_bar;               ///< [3]
   std::vector<double> across_dot, along_dot;  ///< [F]
   std::vector<double> start_dot;              ///< [3 N]
@@ -64,17 +64,17 @@ class DragPotential final : public Potential {
   Vec3 wind_dot = Vec3::Zero();
 
  private:
-  /// What derivatives along several directions share of a face.
+  /// Derivatives of a face that are common to several directions.
   struct Derivative {
     Vec3 u;
     Mat3 by_velocity;  ///< of grad D
-    Mat3 by_frame;     ///< of grad D, by N
+    Mat3 by_frame;     ///< derivative of grad D by N
   };
 
-  /// [F], made when the first one is asked for.
+  /// [F], computed on first use.
   const std::vector<FaceDrag>& drags() const;
   Vec3 velocity(Index f, const double* x) const;
-  /// Those of all faces with drag at x, which last until another point is asked for.
+  /// Derivatives of all faces with drag at x; the reference is valid until another point is used.
   const std::vector<Derivative>& derivatives(const double* x) const;
   void add_product(Index f, const Mat3& slope, const double* z, double* y) const;
   void add_frame_bar(Index f, const Vec3& N_bar);
@@ -83,10 +83,10 @@ class DragPotential final : public Potential {
   Flow flow_;
   double span_;                   ///< h, or 2 h with given velocities [s]
   std::size_t size_;              ///< 3 N
-  std::vector<Index> with_drag_;  ///< faces that have some
+  std::vector<Index> with_drag_;  ///< faces with nonzero drag
   bool of_coefficients_;
   mutable std::vector<FaceDrag> drags_;
-  /// All vertices of cloths; empty where nothing is known.
+  /// Positions of derivatives_, [3 N]; empty: none.
   mutable std::vector<double> derivatives_at_;
   mutable std::vector<Derivative> derivatives_;
 };

@@ -6,17 +6,17 @@
 
 namespace diffcloth::air {
 
-/// The power that one face loses to air which flows past it with the velocity -u,
+/// Power that a face loses to air which flows past it with velocity -u,
 ///
 ///   D(u) = A / 3 (a |u_n|^3 + b |u_t|^3),    u_n = n . u,  u_t = u - u_n n,
 ///
 /// whose gradient is minus the force: a pressure a |u_n| u_n across the face, and a friction b |u_t| u_t
-/// along it. Each depends on its own part of the velocity alone (the independence principle of Taylor 1952);
-/// lift is what the pressure on a tilted face has across the flow. D is convex, so that implicit steps lose
-/// energy for any time step.
+/// along it. Each depends on its own part of the velocity alone (the independence principle of Taylor
+/// 1952); lift is the component of the pressure on a tilted face that is orthogonal to the flow. D is
+/// convex, so that implicit steps lose energy for any time step.
 ///
-/// N = (x_1 - x_0) x (x_2 - x_0) is where n = N / |N| and A = |N| / 2 come from. A face without area feels
-/// nothing.
+/// Normal and area are n = N / |N| and A = |N| / 2 with N = (x_1 - x_0) x (x_2 - x_0). A face without
+/// area has no force.
 ///
 /// References:
 ///     Taylor, "Analysis of the swimming of long and narrow animals", Proceedings of the Royal Society A 214
@@ -49,7 +49,7 @@ struct FaceDrag {
     return area / 3.0 * (across * across_change + along * along_change);
   }
 
-  /// grad D [N], and its parts by a and by b.
+  /// grad D [N], and its derivatives by a and by b.
   Vec3 force(const Vec3& u) const { return across * by_across(u) + along * by_along(u); }
   Vec3 by_across(const Vec3& u) const {
     const double u_n = n.dot(u);
@@ -60,7 +60,7 @@ struct FaceDrag {
     return (area * u_t.norm()) * u_t;
   }
 
-  /// The second derivative of D, positive semi-definite [N s/m].
+  /// Second derivative of D, positive semi-definite [N s/m].
   Mat3 slope(const Vec3& u) const {
     const Vec3 u_t = tangential(u);
     const double speed = u_t.norm();
@@ -84,7 +84,7 @@ struct FaceDrag {
     return 0.5 * bar;
   }
 
-  /// Change of grad D with a change of N: frame_bar(), transposed.
+  /// Change of grad D with a change of N: the transpose of frame_bar().
   Vec3 frame_change(const Vec3& u, const Vec3& N_dot) const {
     const double u_n = n.dot(u);
     const double N_n = n.dot(N_dot);

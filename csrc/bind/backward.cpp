@@ -1,4 +1,5 @@
-// Backward of all environments and losses: which rows there are, and where each writes its gradients.
+// Backward of all environments and losses: layout of the rows, and of the gradients that each row
+// writes.
 
 #include <algorithm>
 #include <cstddef>
@@ -22,12 +23,12 @@ namespace {
 using step::kInputCount;
 using step::kInputTable;
 
-/// The gradient of an input, [losses, environments or 1, count]. Each environment of a loss writes into its
-/// own copy; those of inputs that environments share are then summed in index order.
+/// Gradient of an input, [losses, environments or 1, count]. Each environment of a loss writes into its
+/// own copy; copies of inputs that environments share are then summed in index order.
 struct Wanted {
   std::size_t input, count, copies;
   double* out;
-  std::vector<double> own;  ///< empty where nothing is shared
+  std::vector<double> own;  ///< separate copies; empty if the input is not shared
 
   double* at(std::size_t row) { return (own.empty() ? out : own.data()) + row * count; }
 
@@ -39,7 +40,7 @@ struct Wanted {
   }
 };
 
-/// Zero gradients of the inputs of these names, put into `out`.
+/// Create zero gradients of the named inputs, and add them to `out`.
 std::vector<Wanted> make_gradients(const InputArrays& arrays,
                                    std::size_t losses,
                                    const std::vector<std::string>& needs,
@@ -68,14 +69,14 @@ std::vector<Wanted> make_gradients(const InputArrays& arrays,
   return wanted;
 }
 
-/// Takes the losses of an environment back, which has so many threads.
+/// Pull the losses of an environment back, with this number of threads.
 using PullBack = std::function<void(
     std::size_t environment, std::span<const step::Loss>, int threads, const Checkpoint&)>;
 
-/// Gradients of the inputs that are needed, from cotangents of all losses and environments.
+/// Gradients of the needed inputs, from cotangents of all losses and environments.
 ///
-/// @param costs  what a loss is expected to take in each environment
-/// @param turns  out: of the portions of losses
+/// @param costs  expected cost of one loss in each environment
+/// @param turns  out: order and time of the portions of losses
 nb::dict pull_back_all(const InputArrays& arrays,
                        const Saved& bars,
                        std::size_t losses,
@@ -86,7 +87,7 @@ nb::dict pull_back_all(const InputArrays& arrays,
                        const PullBack& pull_back) {
   nb::dict out;
   std::vector<Wanted> wanted = make_gradients(arrays, losses, needs, out);
-  // A loss that does not depend on an environment has zeros there: that step may even have failed.
+  // Skip losses that do not depend on an environment: its step may even have failed.
   const std::vector<Portion> portions = make_portions(
       arrays.environments, losses, [&](std::size_t row) { return bars.is_zero(row); });
   const std::vector<double> expected = expected_costs(portions, costs);

@@ -6,10 +6,10 @@ namespace diffcloth::bind {
 
 namespace nb = nanobind;
 
-/// `build_info()`: what this core was built with.
+/// `build_info()`: configuration of this build.
 void build_info(nb::module_& m);
 
-/// Bodies and robots over a step, but for what the solver does.
+/// Functions of bodies and robots over a step, before and after the solve.
 void dynamics(nb::module_& m);
 
 /// The simulator's handle: forward and backward of a step.

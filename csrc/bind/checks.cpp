@@ -67,7 +67,7 @@ std::size_t squares_of_coordinates(const step::Scene& scene) {
   return result;
 }
 
-/// Inputs of woven cloth go in pairs, and only where the scene knows its axes.
+/// Inputs of woven cloth are given in pairs, and only if the scene has material axes.
 void check_woven(const step::Scene& scene, const step::Inputs& inputs) {
   using step::Input;
   const auto has = [&](Input input) { return inputs.data(input) != nullptr; };
@@ -79,7 +79,7 @@ void check_woven(const step::Scene& scene, const step::Inputs& inputs) {
           "`stretch_weft` and `bending_weft` need a scene with `material_axes`");
 }
 
-/// Whether a step of the scene needs an input, given which others there are.
+/// Return whether a step of the scene needs an input, depending on the other inputs.
 bool is_needed(const step::Scene& scene, const step::Inputs& inputs, const step::InputRow& row) {
   switch (row.need) {
     case step::Need::kExtent:
@@ -145,7 +145,7 @@ void check_mechanisms(const bodies::MechanismsDescription& m, Index surfaces) {
     const bodies::Link& link = m.links[l];
     const bool root = link.parent == -1;
     roots += root ? 1 : 0;
-    // Trees go one after the other, each with one root, which comes first.
+    // Trees are stored one after another, each with one root, which comes first.
     const bool good = link.parent >= -1 && std::cmp_less(link.parent, l) &&
                       link.tree == roots - 1 && (root || m.links[link.parent].tree == link.tree) &&
                       link.coordinate >= -1;
@@ -202,7 +202,7 @@ void check_inputs(const step::Scene& scene, const step::Inputs& inputs) {
     if (absent && !is_needed(scene, inputs, row)) continue;
     const std::vector<std::size_t> accepted = accepted_counts(scene, row.extent);
     if (!absent && std::ranges::find(accepted, view.count) != accepted.end()) continue;
-    // Words only for what is wrong: each step comes by here.
+    // Build the message only on failure, because this runs in each step.
     const std::string name = std::string("`") + row.name + "`";
     require(!absent, name + " is missing");
     std::string counts;

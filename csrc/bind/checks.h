@@ -8,19 +8,20 @@
 
 namespace diffcloth::bind {
 
-/// Require arrays that fit each other, and indices in range: the core reads by them without asking.
+/// Require arrays of matching sizes, and indices in range: the core reads without further checks.
 ///
 /// @throws std::invalid_argument
 void check_description(const step::Description& description);
 
-/// Likewise trees of links, which a description may leave out.
+/// Check trees of links, which a description may omit.
 void check_mechanisms(const bodies::MechanismsDescription& mechanisms, Index surfaces);
 
-/// Numbers that one environment may have of an input of this extent in this scene; several counts where
-/// it may be given in several ways.
+/// Accepted number of values of an input with this extent in one environment of the scene; several if
+/// the input may have several forms.
 std::vector<std::size_t> accepted_counts(const step::Scene& scene, step::Extent extent);
 
-/// Require that one environment's inputs have all that a step of the scene reads, of accepted counts.
+/// Require that one environment's inputs include all arrays that a step of the scene reads, with
+/// accepted sizes.
 ///
 /// @throws std::invalid_argument
 void check_inputs(const step::Scene& scene, const step::Inputs& inputs);

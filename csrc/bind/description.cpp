@@ -23,7 +23,7 @@ constexpr std::array kBendingModels{
     step::Named<mesh::BendingModel>{"hinge", mesh::BendingModel::kHinge},
 };
 
-/// The value of a name.
+/// Value with this name in a table.
 template <class Value, class Table>
 Value choose(const char* field, const Table& choices, const std::string& name) {
   std::string names;
@@ -69,7 +69,7 @@ std::vector<char> take_flags(NamedFields& fields, const char* name) {
   return flags;
 }
 
-/// Give free roots the coordinates that no joint has, six each, tree after tree.
+/// Assign coordinates without a joint to free roots, six each, tree after tree.
 void assign_roots(bodies::MechanismsDescription& m) {
   const std::size_t n = m.coordinate_tree.size();
   std::size_t c = 0;
@@ -85,7 +85,7 @@ void assign_roots(bodies::MechanismsDescription& m) {
   if (c != n) throw nb::value_error("trees: coordinates must go tree after tree");
 }
 
-/// Trees of links, from the arrays that say what they are.
+/// Read trees of links from their arrays.
 bodies::MechanismsDescription take_mechanisms(NamedFields& fields, Index surfaces) {
   bodies::MechanismsDescription m;
   m.tree_free = take_flags(fields, "tree_free");
@@ -138,7 +138,7 @@ step::AttachmentDescription take_attachments(NamedFields& fields) {
   return d;
 }
 
-/// What surfaces are made of and how they are held.
+/// Read the surfaces, their pins and their attachments.
 void take_surfaces(NamedFields& fields, step::Description& d) {
   d.vertices = fields.doubles("vertices");
   d.rest_positions = fields.doubles("rest_positions");
@@ -163,7 +163,7 @@ void take_surfaces(NamedFields& fields, step::Description& d) {
   if (fields.has("ignored_pairs")) d.ignored_pairs = take_pairs(fields);
 }
 
-/// How a step is taken.
+/// Read the options of a step.
 void take_options(NamedFields& fields, step::Description& d) {
   d.self_contact = fields.take<bool>("self_contact");
   d.dt = fields.take<double>("dt");
@@ -181,7 +181,7 @@ void take_options(NamedFields& fields, step::Description& d) {
   d.options.max_iterations = fields.take<int>("max_iterations");
   if (fields.has("max_seconds")) d.options.max_seconds = fields.take<double>("max_seconds");
   if (fields.has("certify")) d.options.certify = fields.take<bool>("certify");
-  if (fields.has("large_factor")) {  // only tests say it
+  if (fields.has("large_factor")) {  // set by tests only
     d.options.large_factor = fields.take<std::size_t>("large_factor");
   }
   if (fields.has("dear_factor")) d.options.dear_factor = fields.take<double>("dear_factor");

@@ -5,10 +5,10 @@
 
 namespace diffcloth::bind {
 
-/// A scene and its options, from fields by their names.
+/// Build the description of a scene and its options from fields by name.
 ///
-/// @throws std::invalid_argument, nb::value_error or nb::type_error that names the field, also one that
-/// is not known
+/// @throws std::invalid_argument, nb::value_error or nb::type_error that names the field, including
+/// unknown fields
 step::Description describe(NamedFields fields);
 
 }  // namespace diffcloth::bind

@@ -27,15 +27,15 @@ using bodies::SmoothFunction;
 
 [[noreturn]] void refuse(const std::string& what) { throw nb::value_error(what.c_str()); }
 
-/// The place of an array among those of a function; their number if there is none of that name.
+/// Index of an array of a function by name; the number of arrays if there is none.
 std::size_t find(const std::vector<SmoothFunction::Array>& arrays, const std::string& name) {
   std::size_t i = 0;
   while (i < arrays.size() && arrays[i].name != name) ++i;
   return i;
 }
 
-/// Arrays of all environments by the names of a function, with one row for each or one for all,
-/// behind `leading` axes.
+/// Arrays of all environments by the names of a function, with one row for each environment or one for
+/// all, behind `leading` axes.
 class Rows {
  public:
   Rows(const std::vector<SmoothFunction::Array>& arrays, const nb::dict& given, std::size_t leading)
@@ -77,7 +77,7 @@ class Rows {
   std::size_t environments() const { return environments_; }
   std::size_t copies(std::size_t i) const { return copies_[i]; }
 
-  /// Arrays of an environment; null where none is given. `turn` counts along the leading axis.
+  /// Arrays of an environment; null if not given. `turn` is the index along the leading axis.
   std::vector<const double*> row(std::size_t e, std::size_t turn = 0) const {
     std::vector<const double*> result(arrays_.size(), nullptr);
     for (std::size_t i = 0; i < arrays_.size(); ++i) {
@@ -95,7 +95,7 @@ class Rows {
   std::size_t environments_ = 1;
 };
 
-/// Zeroed arrays [leading.., ...] of a function's outputs, put into `out` by their names.
+/// Create zero arrays [leading.., ...] of a function's outputs, and add them to `out` by name.
 std::vector<double*> make_outputs(const SmoothFunction& function,
                                   const std::vector<std::size_t>& leading,
                                   nb::dict& out) {
@@ -166,7 +166,7 @@ nb::dict gradients(const SmoothFunction& function,
     const std::size_t size = function.inputs()[i].size();
     const std::size_t copies = given.copies(i);
     const Owned<double> sum = make_array<double>({losses, copies, size});
-    for (std::size_t e = 0; e < environments; ++e) {  // one after the other: a sum in a fixed order
+    for (std::size_t e = 0; e < environments; ++e) {  // serial: the sum has a fixed order
       for (std::size_t loss = 0; loss < losses; ++loss) {
         double* const to = sum.data + size * (loss * copies + (copies > 1 ? e : 0));
         const double* const part = parts[i].data() + size * (e * losses + loss);
@@ -205,7 +205,7 @@ void require(bool holds, const char* what) {
   if (!holds) refuse(what);
 }
 
-// In the order of their names in Python.
+// Values in the order of their names in Python.
 constexpr std::array kBases{bodies::Base::kFixed, bodies::Base::kKinematic,
                             bodies::Base::kFloating};
 constexpr std::array kActuations{bodies::Actuation::kPosition, bodies::Actuation::kVelocity,

@@ -32,14 +32,14 @@ std::vector<Turn> for_environments(std::size_t count,
     const WithoutGil nogil;
     parallel_for(static_cast<Index>(count), threads, costs, interrupt, timed);
   } catch (const Interrupted&) {
-    throw nb::python_error();  // the error that the signal handler has set
+    throw nb::python_error();  // error set by the signal handler
   }
   return turns;
 }
 
 int threads_each(std::size_t count, int threads) {
-  // The tasks of a factorization of 96 x 96 vertices take a third of the time on four threads: the way
-  // to the root of the elimination tree leaves little to do for more.
+  // On four threads the factorization of 96 x 96 vertices takes a third of the time; more threads gain
+  // little, because the path to the root of the elimination tree is serial.
   constexpr int kMost = 4;
   return std::clamp(threads / std::max(static_cast<int>(count), 1), 1, kMost);
 }

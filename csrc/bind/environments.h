@@ -10,23 +10,23 @@
 
 namespace diffcloth::bind {
 
-/// How a call took one of its environments.
+/// Order and time of one environment in a call.
 struct Turn {
-  int place = 0;         ///< how many began before it
-  double seconds = 0.0;  ///< that it took
+  int place = 0;         ///< number of environments that began before it
+  double seconds = 0.0;  ///< wall-clock time [s]
 };
 
-/// Runs body for every environment on up to `threads` threads, without the GIL; the most expensive
-/// begin. Ctrl-C ends all of them and raises.
+/// Run `body` for every environment on up to `threads` threads, without the GIL, the most expensive
+/// environments first. Ctrl-C stops all of them and raises.
 ///
-/// @param costs  what each is expected to take, in any unit; may be empty. No result depends on it.
+/// @param costs  expected cost of each, in any unit; may be empty. Results do not depend on it.
 std::vector<Turn> for_environments(std::size_t count,
                                    int threads,
                                    std::span<const double> costs,
                                    const std::function<void(Index, const Checkpoint&)>& body);
 
-/// Threads that each of so many environments has for itself, where there are fewer environments than
-/// threads.
+/// Number of threads for each of `count` environments; more than one if there are fewer environments
+/// than threads.
 int threads_each(std::size_t count, int threads);
 
 }  // namespace diffcloth::bind

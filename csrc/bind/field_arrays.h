@@ -9,10 +9,10 @@
 
 namespace diffcloth::bind {
 
-/// Arrays of all environments by name, and what one environment sees of them.
+/// Arrays of all environments by name, and views of one environment.
 class Outputs {
  public:
-  /// Zeroed arrays [rows.., ...] for these fields, put into `out` under prefix + name. Rows are
+  /// Create zero arrays [rows.., ...] for these fields, and add them to `out` as prefix + name. Rows are
   /// environments, or directions and environments.
   Outputs(const std::vector<step::Field>& fields,
           const std::vector<std::size_t>& rows,
@@ -30,7 +30,7 @@ class Outputs {
   std::vector<Entry> entries_;
 };
 
-/// Arrays that came back from Python under prefix + name; their shapes are checked, as hooks on saved
+/// Arrays returned by Python under prefix + name. Their shapes are checked, because hooks on saved
 /// tensors may return anything.
 class Saved {
  public:
@@ -41,7 +41,7 @@ class Saved {
 
   bool is_finite() const;
 
-  /// Whether an environment's arrays are zero throughout.
+  /// True if all arrays of an environment are zero.
   bool is_zero(std::size_t e) const;
 
   step::Arrays<const double> environment(std::size_t e) const;

@@ -9,13 +9,14 @@
 
 namespace diffcloth::bind {
 
-/// The input arrays of a call, and what one environment sees of them.
+/// Input arrays of a call, and views of one environment.
 struct InputArrays {
   std::array<Doubles, step::kInputCount> array;
   std::array<bool, step::kInputCount> present{};
   std::size_t environments = 1;
 
-  /// @param finite  whether numbers are checked too: what came back from Python may be anything
+  /// @param finite  if true, also check that numbers are finite: saved tensors may have been changed in
+  /// Python
   InputArrays(const step::Scene& scene, const nb::dict& inputs, bool finite = false);
 
   bool has(step::Input input) const { return present[static_cast<std::size_t>(input)]; }

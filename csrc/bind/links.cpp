@@ -22,7 +22,7 @@ std::vector<bodies::Link> to_links(const LinkArrays& arrays, Index coordinates) 
     const Index kind = arrays.kind[l];
     const Index coordinate = arrays.coordinate[l];
     const bool known = kind >= 0 && std::cmp_less(kind, kinds.size());
-    // A joint that moves reads its coordinate without a check.
+    // The coordinate of a moving joint is read without a check later.
     if (!known || coordinate >= coordinates || (kinds[kind].moves() && coordinate < 0)) {
       throw std::invalid_argument("trees: kinds and coordinates must be in range");
     }

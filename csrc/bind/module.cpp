@@ -6,11 +6,11 @@
 
 NB_MODULE(_core, m) {
   namespace nb = nanobind;
-  // A script that ends while it holds a graph keeps its simulator to the very end: no leak, and
-  // nothing that its user should read about.
+  // A script that exits while it holds a graph keeps its simulator alive until the end: not a leak, so
+  // suppress the warning.
   nb::set_leak_warnings(false);
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
-  diffcloth::linalg::chosen_level();  // an import fails where the environment names no level
+  diffcloth::linalg::chosen_level();  // import fails if the variable names no level
 
   diffcloth::bind::build_info(m);
   diffcloth::bind::dynamics(m);

@@ -10,14 +10,14 @@
 
 namespace diffcloth::bind {
 
-/// What a description is made from: fields by their names, each of which someone must take.
+/// Fields of a description by name; every field must be consumed.
 class NamedFields {
  public:
   explicit NamedFields(nb::kwargs fields) : fields_(std::move(fields)) {}
 
   bool has(const char* name) const { return fields_.contains(name); }
 
-  /// @throws nb::value_error where it is missing, nb::type_error where it is no T
+  /// @throws nb::value_error if it is missing, nb::type_error if it cannot be converted to T
   template <class T>
   T take(const char* name) {
     if (!has(name)) throw nb::value_error(("core: `" + std::string(name) + "` is missing").c_str());
@@ -33,7 +33,7 @@ class NamedFields {
   std::vector<double> doubles(const char* name) { return to_vector(take<Doubles>(name)); }
   std::vector<Index> indices(const char* name) { return to_vector(take<Indices>(name)); }
 
-  /// @throws nb::value_error that names what nobody has taken
+  /// @throws nb::value_error that names a field that was not consumed
   void refuse_others() const;
 
  private:

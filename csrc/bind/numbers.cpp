@@ -8,7 +8,7 @@
 namespace diffcloth::bind {
 
 bool is_within(const Doubles& array, double largest) {
-  std::int64_t beyond = 0;  // no branch, so that the compiler takes several numbers at once
+  std::int64_t beyond = 0;  // branch-free, so that the compiler can vectorize
   for (std::size_t i = 0; i < array.size(); ++i) {
     beyond |= static_cast<std::int64_t>(!(std::abs(array.data()[i]) <= largest));
   }

@@ -25,7 +25,7 @@ std::vector<Portion> make_portions(std::size_t environments,
 
 std::vector<double> expected_costs(const std::vector<Portion>& portions,
                                    const std::vector<double>& of_environments) {
-  // Contacts and the factor, which the rows of a portion share, take about as long as three rows.
+  // The shared work of a portion, contacts and the factor, costs about as much as three rows.
   constexpr double kShared = 3.0;
   std::vector<double> costs;
   costs.reserve(portions.size());

@@ -6,17 +6,17 @@
 
 namespace diffcloth::bind {
 
-/// Losses, or directions, of an environment that the core takes together.
+/// Losses or directions of an environment that the core processes together.
 struct Portion {
   std::size_t environment;
   std::vector<std::size_t> rows;  ///< loss or direction * environments + environment
 };
 
-/// What each portion is expected to take, from what one row of its environment does, in any unit.
+/// Expected cost of each portion, from the cost of one row in each environment, in any unit.
 std::vector<double> expected_costs(const std::vector<Portion>& portions,
                                    const std::vector<double>& of_environments);
 
-/// All rows but those that are zero, environment by environment.
+/// Partition all nonzero rows, environment by environment.
 std::vector<Portion> make_portions(std::size_t environments,
                                    std::size_t count,
                                    const std::function<bool(std::size_t row)>& is_zero);

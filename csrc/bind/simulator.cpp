@@ -22,7 +22,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), {b}, "tape_", out);
   std::vector<step::Report> reports(b);
   KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b), .costs = std::vector<double>(b)};
-  const std::vector<double> expected = step_seconds_;  // another call may write while this one runs
+  const std::vector<double> expected = step_seconds_;  // another call may write meanwhile
   last_turns_ = for_environments(b, threads, expected, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
     solver::KeptSolves found;
@@ -57,7 +57,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
   const auto all = static_cast<std::size_t>(scene_.vertex_count());
   Owned<double> result = make_array<double>({path.size(), all, 3});
   for (std::size_t k = 0; k < path.size(); ++k) {
-    // Behind the vertices come the coordinates of mechanisms.
+    // Leave out the coordinates of mechanisms, which follow the vertices.
     std::copy_n(path[k].begin(), 3 * all, result.data + 3 * all * k);
   }
   return result.array;
@@ -81,7 +81,7 @@ nb::dict Simulator::stored_energy(const nb::dict& inputs) const {
 }
 
 double Simulator::smallest_nonadjacent_distance() const {
-  // Bodies do not count; their place does not matter.
+  // Positions of bodies do not matter: only cloths are measured.
   std::vector<double> x = scene_.given.rest_positions;
   x.resize(3 * static_cast<std::size_t>(scene_.vertex_count()), 0.0);
   return contact::smallest_nonadjacent_distance(scene_.collision_mesh, x.data());

@@ -16,13 +16,13 @@
 
 namespace diffcloth::bind {
 
-/// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
+/// Data that a step with a tape keeps for its backward pass, by environment; released with the tape.
 struct KeptSteps {
   std::vector<std::shared_ptr<solver::FactorCache::Ticket>> tickets;
-  std::vector<double> costs;  ///< of a derivative, in any unit
+  std::vector<double> costs;  ///< expected cost of a derivative, in any unit
 };
 
-/// A scene as Python holds it: each call takes the arrays of all environments.
+/// Handle of a scene in Python: each call processes the arrays of all environments.
 class Simulator {
  public:
   explicit Simulator(step::Description description)
@@ -63,11 +63,12 @@ class Simulator {
   void forget_factors() { factors_.clear(); }
   std::size_t factor_bytes() const { return factors_.bytes(); }
 
-  /// Of the environments of the last forward(), or of the portions of the last derivative.
+  /// Order and time of the environments of the last forward(), or of the portions of the last
+  /// derivative.
   const std::vector<Turn>& last_turns() const { return last_turns_; }
 
  private:
-  /// The tapes of steps that forward() took, checked.
+  /// Check and return the tapes of steps computed by forward().
   Saved taken_steps(std::size_t environments, const nb::dict& tape, const KeptSteps& kept) const;
 
   step::Scene scene_;
@@ -75,8 +76,8 @@ class Simulator {
   std::vector<step::Field> tape_;
   solver::FactorCache factors_;
 
-  // Read and written with the GIL. What a step took is the best guess of what the next one will take,
-  // and decides nothing but the order in which threads take environments.
+  // Accessed with the GIL held. The time of a step is the best estimate for the next one, and affects
+  // only the order in which threads process environments.
   std::vector<double> step_seconds_;
   std::vector<Turn> last_turns_;
 };

@@ -1,4 +1,4 @@
-// What Python sees of a simulator.
+// Python interface of a simulator.
 
 #include <stdexcept>
 #include <string>
@@ -24,7 +24,7 @@ using namespace nb::literals;  // NOLINT: the literal suffix of nanobind
 
 namespace {
 
-/// Of a table whose rows have names.
+/// Names of the rows of a table.
 template <class Table>
 std::vector<std::string> names_of(const Table& table) {
   std::vector<std::string> names;

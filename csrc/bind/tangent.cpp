@@ -1,4 +1,5 @@
-// Tangents of all environments and directions: which rows there are, and where each writes its outputs.
+// Tangents of all environments and directions: layout of the rows, and of the outputs that each row
+// writes.
 
 #include <algorithm>
 #include <array>
@@ -22,7 +23,7 @@ namespace {
 using step::kInputCount;
 using step::kInputTable;
 
-/// Tangents of inputs by their names, [directions, environments or 1, count].
+/// Tangents of inputs by name, [directions, environments or 1, count].
 class TangentArrays {
  public:
   TangentArrays(const InputArrays& inputs, const nb::dict& tangents, std::size_t directions)
@@ -48,7 +49,7 @@ class TangentArrays {
     }
   }
 
-  /// Tangents of one environment along one direction; null where they are zero throughout.
+  /// Tangents of one environment along one direction; null if all are zero.
   step::Inputs row(std::size_t row) const {
     const std::size_t direction = row / inputs_.environments;
     const std::size_t e = row % inputs_.environments;
@@ -74,7 +75,7 @@ class TangentArrays {
     Doubles array;
   };
 
-  /// Numbers that one environment has of an input.
+  /// Number of values of an input in one environment.
   std::size_t count_of(std::size_t input) const {
     return inputs_.environment(0).views[input].count;
   }
@@ -83,15 +84,15 @@ class TangentArrays {
   std::vector<Given> given_;
 };
 
-/// Pushes directions of an environment forward, which has so many threads.
+/// Push directions of an environment forward, with this number of threads.
 using PushForward = std::function<void(
     std::size_t environment, std::span<const step::Direction>, int threads, const Checkpoint&)>;
 
-/// Tangents of the outputs [directions, environments, ...] along all directions. Those of an environment
-/// whose inputs do not change are zero: that step may even have failed.
+/// Tangents of the outputs [directions, environments, ...] along all directions. Tangents of an
+/// environment whose inputs do not change are zero: its step may even have failed.
 ///
-/// @param costs  what a direction is expected to take in each environment
-/// @param turns  out: of the portions of directions
+/// @param costs  expected cost of one direction in each environment
+/// @param turns  out: order and time of the portions of directions
 nb::dict push_forward_all(const InputArrays& arrays,
                           const std::vector<step::Field>& fields,
                           const nb::dict& tangents,

@@ -10,10 +10,10 @@ namespace {
 
 using namespace std::chrono_literals;
 
-/// Never destroyed: threads look at it while the process ends.
+/// State shared by all threads; never destroyed, because threads read it during process exit.
 struct Parking {
   std::atomic<bool> abandoned{false};
-  std::atomic<unsigned long> closer{0};  // the thread that comes back; set before `abandoned`
+  std::atomic<unsigned long> closer{0};  // the only thread that may return; set before `abandoned`
   std::mutex mutex;
   std::vector<unsigned long> parked;  // guarded by the mutex
 };

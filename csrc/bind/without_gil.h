@@ -6,11 +6,11 @@
 
 namespace diffcloth::bind {
 
-/// Work without the GIL, as nb::gil_scoped_release has it, that survives the end of the interpreter.
+/// Scope without the GIL, like nb::gil_scoped_release, that is safe during interpreter shutdown.
 ///
-/// Python ends a thread that wants the GIL once the interpreter ends, by unwinding its stack: where that
-/// has destructors, which may not throw, the whole process is aborted. A daemon thread is therefore
-/// parked instead of given the GIL back: until the process ends, which needs no other thread.
+/// After finalization, Python terminates a thread that requests the GIL by unwinding its stack;
+/// destructors on that stack must not throw, so the process would abort. A daemon thread is therefore
+/// parked until process exit instead of reacquiring the GIL.
 class WithoutGil {
  public:
   WithoutGil() : state_(PyEval_SaveThread()) {}
@@ -22,13 +22,13 @@ class WithoutGil {
   PyThreadState* state_;
 };
 
-/// From now on no call comes back to Python, but in the thread that calls this.
+/// Stop all calls from returning to Python, except in the calling thread.
 void abandon_calls();
 
-/// Whether that is so for this thread: nobody waits for its result, and the GIL must not be asked for.
+/// True if this thread must not reacquire the GIL; no caller waits for its result.
 bool is_abandoned();
 
-/// Identifiers of the threads that are parked, by which Python knows them.
+/// Python identifiers of the parked threads.
 std::vector<unsigned long> parked_threads();
 
 }  // namespace diffcloth::bind

@@ -13,14 +13,14 @@ namespace {
 
 constexpr std::size_t kBodyCoordinates = 6;
 
-/// Inputs that both functions have.
+/// Inputs common to both functions.
 struct OfBodies {
   enum Input : std::uint8_t { kMass, kCenter, kInertia, kPoses, kSharedCount };
 };
 
 using BodyArrays = std::vector<SmoothFunction::Array>;
 
-/// Of all bodies, from shapes that each has.
+/// Add the dimension of the bodies to the shapes of one body.
 BodyArrays of_bodies(std::size_t bodies, BodyArrays arrays) {
   for (SmoothFunction::Array& array : arrays) array.shape.insert(array.shape.begin(), bodies);
   return arrays;
@@ -37,9 +37,9 @@ BodyArrays with_gravity(BodyArrays inputs) {
   return inputs;
 }
 
-/// How a body with the inertia J and the angular momentum l, in its axes, turns by itself.
+/// Free rotation of a body with inertia J and angular momentum l, in its axes.
 ///
-/// @return the quaternion, and whether it was found
+/// @return the quaternion, and true if it was found
 std::pair<Quaternion4<double>, bool> free_turn_of(const Matrix3<double>& J,
                                                   const Vector3<double>& l,
                                                   double time) {
@@ -63,7 +63,7 @@ std::pair<Quaternion4<Recorded>, bool> free_turn_of(const Matrix3<Recorded>& J,
   Quaternion4<Recorded> result;
   for (int i = 0; i < 4; ++i) {
     result[i] = turn[i];
-    // Adds zero.
+    // The added value is zero; only the derivatives are recorded.
     for (int j = 0; j < 12; ++j) result[i] += rate[i][j] * (given[j] - numbers[j]);
   }
   return {result, found};

@@ -7,8 +7,8 @@
 
 namespace diffcloth::bodies {
 
-/// Free bodies of a scene over one step by themselves, and their state after the step is solved: for
-/// their equations see diffcloth_torch/dynamics/bodies.py, which names all arrays.
+/// Motion of the free bodies of a scene over one step without contact, and their state after the solve.
+/// Equations and names of all arrays: diffcloth_torch/dynamics/bodies.py.
 std::unique_ptr<SmoothFunction> body_prediction(std::size_t bodies, double dt);
 std::unique_ptr<SmoothFunction> body_advance(std::size_t bodies, double dt);
 

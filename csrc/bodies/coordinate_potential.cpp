@@ -7,7 +7,7 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// Duals this near the direction of friction are dropped.
+/// Duals are dropped if all differ from the direction of friction by at most this.
 constexpr double kClose = 0.1;
 
 }  // namespace
@@ -171,7 +171,7 @@ void CoordinatePotential::add_hessian(const double* x,
       }
     }
   }
-  // Convex: its own positive part.
+  // The barrier is convex: it equals its positive part.
   visit_limits(nodes, [&](Index slot, double, double u, double w, double k) {
     if (!(u < w)) return;
     Vec3 diagonal = Vec3::Zero();

@@ -8,24 +8,25 @@
 
 namespace diffcloth::bodies {
 
-/// The potential of the mechanisms' coordinates q themselves:
+/// Potential of the mechanisms' coordinates q:
 ///
 ///   sum over trees of 1/2 (q - t)^T A (q - t)  +  sum over limits of k b(u)  +  sum of joints' terms,
 ///
-/// with everything quadratic (inertia, drives, damping) in the metric A and the target t. A limit acts
-/// from itself to `limit_zone` of the joint's range beyond it, its end: u is what is left to the end, and
+/// with all quadratic terms (inertia, drives, damping) in the metric A and the target t. A limit acts up
+/// to the end of a zone beyond it, whose width w is `limit_zone` times the joint's range: u is the
+/// distance left to the end, and
 ///
-///   b(u) = -(u - w)^2 log(u / w),   w the width of that zone,   0 for u >= w.
+///   b(u) = -(u - w)^2 log(u / w),   0 for u >= w.
 ///
-/// For a joint's own term see JointTerm. Its friction has a kink, which Newton's method would cross to
-/// and fro: it has duals, as that of contacts has (contact/friction_set.h).
+/// JointTerm defines the term of a joint. Its friction has a kink, across which Newton's method would
+/// oscillate: it has duals, as friction of contacts has (contact/friction_set.h).
 class CoordinatePotential final : public Potential {
  public:
-  /// @param first_point  of the nodes among all points
-  /// @param first_row    of the nodes in the linear system
+  /// @param first_point  index of the first node among all points
+  /// @param first_row    row of the first node in the linear system
   /// @param targets      t [n]
-  /// @param metric       A, row by row, tree after tree [sum n_t^2]; its symmetric part counts
-  /// @param joints       rows of JointTerm [n]; null where no coordinate has such a term
+  /// @param metric       A, row by row, tree after tree [sum n_t^2]; only its symmetric part is used
+  /// @param joints       rows of JointTerm [n]; null: none
   /// @param h            time step [s]
   CoordinatePotential(const Mechanisms& mechanisms,
                       Index first_point,
@@ -53,10 +54,11 @@ class CoordinatePotential final : public Potential {
     store.exchange(joint_bar);
   }
 
-  /// The value q of a coordinate, or where its limit of the speed lets it come instead.
+  /// Value q of a coordinate, clamped to the middle of the zone beyond its speed limit.
   double within_speed(Index coordinate, double q) const;
 
-  /// Of what is left to the ends of the limits of speeds, the fraction of a change that uses a share.
+  /// Largest fraction of the change dx that uses at most `share` of the distances left to the ends of
+  /// the speed limits.
   double largest_fraction(const double* x, const double* dx, double share) const;
 
   /// Append the diagonal of A for each number of the nodes.
@@ -71,19 +73,18 @@ class CoordinatePotential final : public Potential {
 
  private:
   struct Tree {
-    std::vector<Index> slot;  // of its coordinates among the numbers of the nodes
+    std::vector<Index> slot;  // slots of its coordinates among the numbers of the nodes
     Index first_coordinate;
-    std::size_t metric;  // where its block of A starts
+    std::size_t metric;  // start of its block of A
     Index first_node, last_node;
-    double fill;  // for the numbers of nodes that hold no coordinate
+    double fill;  // diagonal for numbers of nodes without a coordinate
   };
 
   double at(const Tree& tree, Index i, Index j) const {
     const std::size_t n = tree.slot.size();
     return 0.5 * (metric_[tree.metric + n * i + j] + metric_[tree.metric + n * j + i]);
   }
-  /// Visit the limits of free joints that act at some nodes: visit(slot, sign, u, w, k), where q moves
-  /// u by -sign.
+  /// Visit the limits of free joints: visit(slot, sign, u, w, k), where du/dq = -sign.
   template <class Visit>
   void visit_limits(const double* nodes, Visit&& visit) const;
 
@@ -103,7 +104,7 @@ class CoordinatePotential final : public Potential {
   double h_;
   std::vector<Tree> trees_;
   std::vector<double> duals_;     // [n] directions of friction
-  std::vector<double> duals_at_;  // numbers of the nodes where they hold; empty: nowhere
+  std::vector<double> duals_at_;  // numbers of the nodes for the duals; empty: no duals
 };
 
 }  // namespace diffcloth::bodies

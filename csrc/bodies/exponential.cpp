@@ -10,7 +10,7 @@ struct Series {
   double f, f1, f2;
 };
 
-/// Below this |w|^2 the series is summed: eight terms leave less than 1e-17.
+/// Bound of |w|^2 below which the series is summed; eight terms leave an error below 1e-17.
 constexpr double kSmall = 0.25;
 constexpr int kTerms = 8;
 
@@ -48,7 +48,7 @@ Series sine(double s) {
   return {.f = f, .f1 = f1, .f2 = f2};
 }
 
-/// (1 - cos(t)) / t^2 likewise.
+/// (1 - cos(t)) / t^2 as a function of s = t^2.
 Series cosine(double s) {
   if (s < kSmall) return sum(s, 2);
   const double t = std::sqrt(s);
@@ -63,7 +63,8 @@ Series cosine(double s) {
 }  // namespace
 
 // R = I + a K + b K^2 with K = w x, a = sin t / t, b = (1 - cos t) / t^2 and t = |w|. Derivatives of a
-// and b are with respect to s = t^2, whose own are 2 w_i and 2 delta_ij; those of K are E_i = e_i x.
+// and b are with respect to s = t^2, and ds/dw_i = 2 w_i, d2s/dw_i dw_j = 2 delta_ij, dK/dw_i = E_i =
+// e_i x.
 Exponential::Exponential(const Vec3& w) {
   const double s = w.squaredNorm();
   const Series a = sine(s);
@@ -71,7 +72,7 @@ Exponential::Exponential(const Vec3& w) {
   const Mat3 K = cross_matrix(w);
   const Mat3 K2 = K * K;
   std::array<Mat3, 3> E;
-  std::array<Mat3, 3> EK;  // of K^2
+  std::array<Mat3, 3> EK;  // derivatives of K^2
   for (int i = 0; i < 3; ++i) {
     E[i] = cross_matrix(Vec3::Unit(i));
     EK[i] = E[i] * K + K * E[i];

@@ -8,7 +8,7 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// Of the scale of x: a step that counts as none, and one that is rounding if it does not shrink.
+/// Step sizes relative to x: converged; and dominated by rounding if the step no longer shrinks.
 constexpr double kTolerance = 1e-12;
 constexpr double kFloor = 1e-8;
 constexpr int kMostIterations = 40;
@@ -23,7 +23,7 @@ bool solve(const FreeMotion<double>& motion, VectorXd& x) {
   const Configuration<double>& start = motion.start;
   const std::vector<PlacedBody<double>> here =
       place(motion.tree, motion.inertia, start.rotation, start.joints);
-  // Without velocity products, but for those of what is prescribed.
+  // Start without velocity products, except those of prescribed velocities.
   const VectorXd carried = rates(motion.tree, motion.inertia, here, motion.known).momentum;
   const Eigen::MatrixXd mass = mass_matrix(motion.tree, motion.inertia, here);
   const VectorXd rest = motion.given - carried;
@@ -39,7 +39,7 @@ bool solve(const FreeMotion<double>& motion, VectorXd& x) {
     x += step;
     const double size = largest(step);
     const double whole = std::max(largest(x), scale);
-    // The next step, which shrinks at least as this one did.
+    // Predicted size of the next step, which contracts at least as this one did.
     const double ahead = iteration == 0 ? size : size * (size / last);
     found = ahead <= kTolerance * whole || (size <= kFloor * whole && size >= last / 2.0);
     if (found) break;

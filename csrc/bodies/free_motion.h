@@ -7,16 +7,17 @@
 
 namespace diffcloth::bodies {
 
-/// Where the root and the joints are. The place of the root's center of mass is not needed here.
+/// Orientation of the root and values of the joints. The position of the root's center of mass is not
+/// needed.
 template <class T>
 struct Configuration {
   Matrix3<T> rotation;  ///< of the root
   VectorX<T> joints;
 };
 
-/// The configuration after a time at constant velocities.
+/// Configuration after a time at constant velocities.
 ///
-/// @param root_moves  whether the root follows its velocity, or stays
+/// @param root_moves  true if the root follows its velocity; otherwise it stays
 template <class T>
 Configuration<T> moved(const Configuration<T>& start,
                        const VectorX<T>& nu,
@@ -43,7 +44,8 @@ TreeRates<T> rates_at_middle(const Tree& tree,
   return rates<T>(tree, inertia, place<T>(tree, inertia, middle.rotation, middle.joints), nu);
 }
 
-/// Velocities nu of a tree over a step of which only what is given knows anything: those with
+/// Equation for the velocities nu of a tree over a step. With the momentum at the start and the impulse of
+/// all forces in `given`:
 ///
 ///   r(nu) = p(q_mid, nu) - h/2 s(q_mid, nu) - given = 0
 ///
@@ -57,7 +59,7 @@ struct FreeMotion {
   double dt;
   TreeInertia<T> inertia;
   Configuration<T> start;
-  VectorX<T> known;  ///< nu where it is prescribed, zero elsewhere
+  VectorX<T> known;  ///< nu in prescribed rows, zero elsewhere
   VectorX<T> given;
 
   VectorX<T> complete(const VectorX<T>& x) const {
@@ -74,9 +76,9 @@ struct FreeMotion {
   }
 };
 
-/// Solve by Broyden's method from the velocities that M(q_n) alone would give.
+/// Solve by Broyden's method, starting from the velocities of M(q_n) without velocity products.
 ///
-/// @return whether they were found
+/// @return true if it converged
 bool solve(const FreeMotion<double>& motion, Eigen::VectorXd& x);
 
 }  // namespace diffcloth::bodies

@@ -12,11 +12,11 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// The largest angle [rad] of a series. Its radius of convergence is a quarter of a turn: the poles
-/// of l are where its fastest hyperbolic functions have theirs.
+/// Largest angle [rad] of one series. The radius of convergence is a quarter of a turn, limited by the
+/// poles of l: the poles of its fastest hyperbolic functions.
 constexpr double kAngle = 0.25;
 constexpr double kRadius = 1.5;
-/// What the last term is beside the first, and the most terms that takes.
+/// Last term relative to the first, and the largest number of terms to reach it.
 constexpr double kRounding = 1e-18;
 constexpr int kMostTerms = 24;
 constexpr double kMostSeries = 2e4;
@@ -51,19 +51,19 @@ using Three = std::array<T, 3>;
 template <class T>
 using Four = std::array<T, 4>;
 
-/// How many terms a series over an angle [rad] takes.
+/// Number of terms of a series over an angle [rad].
 int term_count(double angle) {
   const double ratio = std::max(angle / kRadius, kRounding);
   return std::min(kMostTerms, 2 + static_cast<int>(std::log(kRounding) / std::log(ratio)));
 }
 
-/// q and l from the start to the end of a series.
+/// Advance q and l over one series.
 template <class T>
 void advance(
     const std::array<Three<T>, 3>& inverse, double time, int terms, Four<T>& q, Three<T>& l) {
   std::array<Four<T>, kMostTerms + 1> qs{q};
   std::array<Three<T>, kMostTerms + 1> ls{l};
-  std::array<Three<T>, kMostTerms + 1> ws;  // of the time scaled to 1
+  std::array<Three<T>, kMostTerms + 1> ws;  // for time scaled to 1
   for (int k = 0; k < terms; ++k) {
     for (std::size_t i = 0; i < 3; ++i) {
       ws[k][i] =
@@ -103,7 +103,7 @@ bool free_turn(
   const Mat3 inverse =
       Mat3(Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(inertia)).inverse();
   const Vec3 l_start = row(momentum, 0);
-  // |omega| <= sqrt(2 T / least J), and the largest 1/J is at most the trace.
+  // omega| <= sqrt(2 T / smallest J), and the largest 1/J is at most the trace of J^-1.
   const double speed = std::sqrt(l_start.dot(inverse * l_start) * inverse.trace());
   const double series = std::max(1.0, std::ceil(speed * time / kAngle));
   if (!(series <= kMostSeries)) return false;

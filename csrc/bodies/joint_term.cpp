@@ -19,7 +19,7 @@ struct Excess {
 
   double limited() const { return w * r / s; }
   double lost() const { return w * r * (r * r / (s * (s + 1.0))); }  ///< w r - w r / s
-  double slope() const { return 1.0 / (s * s * s); }                 ///< of the limited effort by a
+  double slope() const { return 1.0 / (s * s * s); }                 ///< d limited() / da
 
   double w;
   double r;
@@ -34,7 +34,7 @@ double lost_work(double a, double b, double slip, const JointTerm& term) {
   const Excess to(std::max(b, 0.0), term.effort_limit);
   if (from.r == 0.0 && to.r == 0.0) return 0.0;
   const double mean = from.w * (from.r + to.r) * (0.5 - 1.0 / (from.s + to.s));
-  // Where only a part of the way is beyond, that part of the slip.
+  // If only a part of the motion exceeds the linear range, use that part of the slip.
   if (from.r == 0.0 || to.r == 0.0) slip = from.w * (from.r - to.r) / term.stiffness;
   return mean * slip;
 }
@@ -48,7 +48,7 @@ double friction_change(double from, double to, double e) {
   return (b - a) * ((a + b) / e - (a * a + a * b + b * b) / (3.0 * e * e));
 }
 
-/// The zone beyond a limit of the speed, as a slip.
+/// Zone beyond a speed limit, in units of the slip.
 struct Zone {
   Zone(const JointTerm& term, const JointConstants& c)
       : reach(term.velocity_limit * c.h),

@@ -1,17 +1,17 @@
 #pragma once
 
-// A link, the joint that carries it, and how both move; of doubles or of recorded numbers.
+// A link, the joint that carries it, and the motion of both; of doubles or of recorded numbers.
 //
-// The twist of a joint is the velocity of all that it carries at a unit rate of its coordinate. With
-// the axis z through the point o, a joint of kind (turn, slide) that follows its coordinate m times as
-// fast has
+// The twist of a joint is the velocity of all links that it carries at a unit rate of its coordinate.
+// With the axis z through the point o, a joint of kind (turn, slide) that follows its coordinate with
+// multiplier m has
 //
 //   angular = m turn z,   linear = m slide z + o x angular
 //
-// where `linear` is the velocity of the point at the origin of the frame in which all is expressed.
-// The point at x moves by  linear + angular x x. Joints that carry a joint move its twist like a rigid
-// body, and no other joint does. So the second derivative of a point by joint i and by joint j, which
-// joint i carries or is, is  angular_i x dx/dq_j.
+// where `linear` is the velocity of the point at the origin of the reference frame. The point at x moves
+// by  linear + angular x x. Joints that carry a joint move its twist like a rigid body, and no other
+// joint does. The second derivative of a point by joints i and j, where joint i carries or is joint j,
+// is therefore  angular_i x dx/dq_j.
 
 #include <cmath>
 
@@ -29,16 +29,16 @@ struct Link {
   Index tree;
   Index parent;  ///< -1 for a root
   JointKind kind;
-  Mat34 offset;  ///< of the joint's frame in the parent's
-  Vec3 axis;     ///< of unit length, in the joint's frame
+  Mat34 offset;  ///< of the joint's frame in the parent's frame
+  Vec3 axis;     ///< unit vector in the joint's frame
   Index coordinate;
   double multiplier;
   double constant;
 
   bool moves() const { return kind.moves(); }
-  /// Angle [rad] by a unit of the coordinate.
+  /// Angle [rad] per unit of the coordinate.
   double turn() const { return multiplier * kind.turn; }
-  /// Shift [m] by a unit of the coordinate.
+  /// Shift [m] per unit of the coordinate.
   double slide() const { return multiplier * kind.slide; }
 };
 
@@ -74,8 +74,8 @@ struct Twist {
 template <class T>
 struct Placed {
   Matrix3<T> rotation;
-  Vector3<T> origin;  ///< of its frame; the axis of its joint goes through it
-  Twist<T> joint;     ///< of the joint to the parent; zero where it is fixed
+  Vector3<T> origin;  ///< of its frame; on the axis of its joint
+  Twist<T> joint;     ///< of the joint to the parent; zero if fixed
 };
 
 /// Rotation by an angle about a constant axis of unit length.
@@ -100,7 +100,7 @@ Matrix3<T> axis_rotation(const Vec3& axis, const T& angle) {
 
 /// Place a link on its parent.
 ///
-/// @param coordinate  of its joint; ignored where that is fixed
+/// @param coordinate  of its joint; ignored if the joint is fixed
 template <class T>
 Placed<T> place_on(const Placed<T>& parent, const Link& link, const T& coordinate) {
   Placed<T> p;

@@ -16,7 +16,7 @@ struct Mechanisms::Eval {
   Vec3 center = Vec3::Zero();
   Mat34 frame;                               // S
   std::vector<Placed<double>> links;         // in the root's frame
-  std::vector<Mat34> to_root;                // C_l, the same as matrices
+  std::vector<Mat34> to_root;                // C_l, as matrices
   std::vector<std::vector<Mat34>> by_joint;  // [link][k]: dC_l by the k-th joint of its path
 };
 

@@ -1,4 +1,4 @@
-// What of mechanisms does not change: trees, nodes of coordinates, paths of joints, surfaces and levers.
+// Constant data of mechanisms: trees, nodes of coordinates, paths of joints, surfaces and levers.
 
 #include <algorithm>
 #include <cmath>
@@ -87,7 +87,7 @@ void Mechanisms::make_surfaces(const BodySet& bodies, const std::vector<Index>& 
                     .first = bodies.vertex_start[s],
                     .last = bodies.vertex_start[s + 1]};
     if (surface.tree >= 0) trees_[surface.tree].surfaces.push_back(static_cast<Index>(s));
-    // The six coordinates of a free root may be prescribed too, all of them.
+    // The six coordinates of a free root are either all free or all prescribed.
     const auto moves_with_any = [&](auto&& counts) {
       return (surface.tree >= 0 && trees_[surface.tree].free &&
               counts(trees_[surface.tree].first_coordinate)) ||
@@ -126,7 +126,7 @@ std::vector<Mechanisms::FreeBody> Mechanisms::free_bodies() const {
 
 void Mechanisms::find_levers() {
   lever_.assign(3 * static_cast<std::size_t>(node_count()), 0.0);
-  // Where all joints are at zero.
+  // Configuration with all joints at zero.
   std::vector<double> zero(3 * static_cast<std::size_t>(point_count()), 0.0);
   for (const Tree& tree : trees_) {
     for (int a = 0; a < 3; ++a) zero[3 * (tree.frame + a) + a] = 1.0;
@@ -166,7 +166,7 @@ void Mechanisms::find_levers() {
       const Index k = c - tree.first_coordinate;
       double& lever = lever_[slot_[c]];
       if (tree.free && k < 6) lever = k < 3 ? 1.0 : reach;
-      // A joint that turns points on its axis alone, or nothing: as far as others do.
+      // Joints that rotate only points on their axis, or none, get the largest lever of the others.
       if (lever == 0.0) lever = largest > 0.0 ? largest : std::max(reach, 1.0);
     }
   }

@@ -9,7 +9,7 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// A B of rigid (or linear) transforms, each a 3 x 4 matrix.
+/// Product A B of rigid (or linear) transforms, each a 3 x 4 matrix.
 Mat34 compose(const Mat34& a, const Mat34& b) {
   Mat34 c;
   c.leftCols<3>() = a.leftCols<3>() * b.leftCols<3>();
@@ -22,8 +22,8 @@ double inner(const Mat3& a, const Mat3& b) { return a.cwiseProduct(b).sum(); }
 
 }  // namespace
 
-// With moments M_l = sum over its vertices of ybar [v; 1]^T, whatever is linear in the vertices is an
-// inner product with M_l.
+// With moments M_l = sum over its vertices of ybar [v; 1]^T, every linear function of the vertices of
+// link l is an inner product with M_l.
 
 Mechanisms::Eval Mechanisms::evaluate(const Tree& tree, const double* points) const {
   Eval e;
@@ -68,7 +68,7 @@ void Mechanisms::set_frames_jvp(const double* poses, const double* change, doubl
   for (const Tree& tree : trees_) {
     const Pose of_tree = Eigen::Map<const Pose>(change + 7 * tree.given);
     Pose turn = of_tree;
-    turn.head<3>().setZero();  // columns of R do not move with the position
+    turn.head<3>().setZero();  // columns of R do not depend on the position
     transform_jvp(Eigen::Map<const Pose>(poses + 7 * tree.given), turn, basis.data(), 3,
                   points + 3 * tree.frame);
     Eigen::Map<Vec3>(points + 3 * (tree.frame + 3)) = of_tree.head<3>();
@@ -81,7 +81,7 @@ void Mechanisms::set_frames_vjp(const double* poses,
   const Mat3 basis = Mat3::Identity();
   for (const Tree& tree : trees_) {
     const Pose pose = Eigen::Map<const Pose>(poses + 7 * tree.given);
-    // The columns of R are the images of the axes, but do not move with the position.
+    // The columns of R are the images of the axes, but do not depend on the position.
     Pose bar = transform_vjp(pose, basis.data(), 3, points_bar + 3 * tree.frame);
     bar.head<3>() = row(points_bar, tree.frame + 3);
     Eigen::Map<Pose>(poses_bar + 7 * tree.given) += bar;
@@ -204,7 +204,7 @@ void Mechanisms::pull_back(const double* points,
   }
 }
 
-/// Second derivatives by the numbers of a tree's nodes, prescribed ones included.
+/// Second derivatives by the numbers of a tree's nodes, including prescribed ones.
 Eigen::MatrixXd Mechanisms::curvature(const Tree& tree,
                                       const Eval& e,
                                       const std::vector<Mat34>& moment) const {
@@ -262,7 +262,7 @@ void Mechanisms::pull_back_change(const double* points,
     const Eigen::MatrixXd k = curvature(tree, e, moment);
     Eigen::Map<Eigen::VectorXd>(points_bar + 3 * tree.first_node, k.rows()) +=
         k.lazyProduct(Eigen::Map<const Eigen::VectorXd>(change + 3 * tree.first_node, k.cols()));
-    // By the frame: of Rdot S C m + R S Cdot m.
+    // Derivative by the frame, of Rdot S C m + R S Cdot m.
     const Mat3 d_turn = turn_rate(tree, e, change);
     for (Index l = tree.first_link; l < tree.last_link; ++l) {
       const Index at = l - tree.first_link;
@@ -279,7 +279,7 @@ void Mechanisms::pull_back_change(const double* points,
   }
 }
 
-// One coordinate after the other: only frames that move take the second part.
+// The contribution of moving frames is computed one coordinate at a time.
 void Mechanisms::push_forward_change(const double* points,
                                      const double* change,
                                      const double* g,
@@ -338,7 +338,7 @@ void Mechanisms::differentiate(const double* points,
       const Surface& s = surface_[surface];
       if (!s.dynamic || s.first == s.last) continue;
       const Index at = s.link - tree.first_link;
-      // The derivative of the link's transform by each number of its nodes, in their order.
+      // Derivatives of the link's transform by each number of its nodes, in their order.
       const auto* const begin = out.begin(out.first + s.first);
       const auto count = static_cast<std::size_t>(out.end(out.first + s.first) - begin);
       std::vector<std::array<Mat34, 3>> d(count);
@@ -395,7 +395,7 @@ double Mechanisms::turn_between(const double* from, const double* to) const {
   for (const Tree& tree : trees_) {
     double root = 0.0;
     if (!tree.free) {
-      // Of the frames' rotations: |R_b - R_a|_F = 2 sqrt(2) sin(angle / 2).
+      // Angle between the frames' rotations: |R_b - R_a|_F = 2 sqrt(2) sin(angle / 2).
       double sum = 0.0;
       for (int a = 0; a < 3; ++a) {
         sum += (row(to, tree.frame + a) - row(from, tree.frame + a)).squaredNorm();

@@ -13,36 +13,36 @@
 
 namespace diffcloth::bodies {
 
-/// What mechanisms are made from. Trees are the bodies of a scene, then its robots.
+/// Description of mechanisms. Trees are the bodies of a scene, then its robots.
 struct MechanismsDescription {
-  std::vector<char> tree_free;  ///< [T] roots that move by dynamics: six coordinates, c and w
-  std::vector<Link> links;      ///< tree after tree, parents before their children
-  std::vector<Index> coordinate_tree;  ///< [n] those of a free root first, tree after tree
-  std::vector<char> prescribed;        ///< [n] coordinates whose values at the end are given
-  std::vector<char> held;              ///< [n] those that forces move, prescribed in this solve
-  std::vector<double> lower;           ///< [n] limits of free joints; infinite where there are none
+  std::vector<char> tree_free;         ///< [T] nonzero for dynamic roots: six coordinates, c and w
+  std::vector<Link> links;             ///< tree after tree, parents before their children
+  std::vector<Index> coordinate_tree;  ///< [n] tree after tree, coordinates of a free root first
+  std::vector<char> prescribed;        ///< [n] nonzero if the value at the end of the step is given
+  std::vector<char> held;              ///< [n] nonzero if dynamic, but prescribed in this solve
+  std::vector<double> lower;           ///< [n] limits of free joints; infinite: none
   std::vector<double> upper;
   std::vector<double> limit_stiffness;  ///< [n]
-  /// Share of its range that a joint can go beyond a limit, and of a limit of its speed.
+  /// Width of the zone beyond a limit, relative to the joint's range, and relative to a speed limit.
   double limit_zone = 0.0;
   std::vector<double> velocity_stiffness;  ///< [n] see JointConstants
   std::vector<double> velocity_force;      ///< [n]
   std::vector<Index> surface_link;         ///< [surfaces]
 };
 
-/// Trees of rigid links, and how the vertices of their surfaces follow from coordinates.
+/// Trees of rigid links, and the vertices of their surfaces as functions of coordinates.
 ///
 /// The root of a tree has a frame S, a rigid transform. A point of link l with coordinates v in the
 /// link's axes is at
 ///
-///   y = c + R(w) (S C_l(q) v)   where the root is free,     y = S C_l(q) v   where it is prescribed,
+///   y = c + R(w) (S C_l(q) v)   if the root is free,     y = S C_l(q) v   if it is prescribed,
 ///
 /// with C_l the transform from link l to the root, by the joints between them.
 ///
-/// Coordinates and frames live in nodes of three numbers, so that they can stand among vertices in one
-/// list of points: first `node_count` nodes of coordinates, of which each holds only free or only
-/// prescribed ones of one tree (and zeros where a group of three is not full), then four nodes a tree:
-/// the columns of S. A body that has no coordinate at all is left to BodySet.
+/// Coordinates and frames are stored in nodes of three numbers, so that they share one list of points
+/// with vertices: first `node_count` nodes of coordinates, each of which holds only free or only
+/// prescribed ones of one tree (padded with zeros), then four nodes a tree: the columns of S. A body
+/// without coordinates is handled by BodySet.
 class Mechanisms {
  public:
   Mechanisms() = default;
@@ -59,29 +59,29 @@ class Mechanisms {
 
   const MechanismsDescription& given() const { return given_; }
 
-  /// Place of a coordinate among the numbers of the nodes.
+  /// Index of a coordinate among the numbers of the nodes.
   Index slot(Index coordinate) const { return slot_[coordinate]; }
   bool is_prescribed(Index node) const { return node_prescribed_[node] != 0; }
 
   /// Nodes of each tree, whose coordinates depend on each other.
   std::vector<std::vector<Index>> cliques() const;
 
-  /// A tree that is one rigid body in free flight: six coordinates, which no joint, drive or limit knows.
+  /// A tree that is one rigid body in free flight: six coordinates, without joint, drive or limit.
   struct FreeBody {
     Index first_node, last_node;
-    std::vector<Index> surfaces;  ///< among those of bodies
+    std::vector<Index> surfaces;  ///< indices among the surfaces of bodies
   };
   std::vector<FreeBody> free_bodies() const;
 
-  /// Whether a surface belongs to these trees, and whether it moves with free coordinates.
+  /// True if a surface belongs to these trees; is_dynamic(): if it moves with free coordinates.
   bool has_surface(Index surface) const { return surface_[surface].tree >= 0; }
   bool is_dynamic(Index surface) const { return surface_[surface].dynamic; }
-  /// Whether it moves with free coordinates or with held ones: collisions with it count.
+  /// True if it moves with free coordinates or with held ones, so that collisions with it matter.
   bool collides(Index surface) const { return surface_[surface].collides; }
 
-  /// Frames S of the trees from the poses of all roots, into their nodes.
+  /// Compute the frames S of the trees from the poses of all roots, into their nodes.
   void set_frames(const double* poses, double* points) const;
-  /// poses_bar += pulled back cotangents of the frames' nodes.
+  /// poses_bar += cotangents of the frames' nodes, pulled back.
   void set_frames_vjp(const double* poses, const double* points_bar, double* poses_bar) const;
 
   /// Change of the frames' nodes with a change of the poses.
@@ -107,7 +107,7 @@ class Mechanisms {
                         double* points_bar) const;
 
   /// points_dot += at the nodes of coordinates, the derivative by them of  (push_forward of change) . g,
-  /// for a change of coordinates and frames: pull_back_change(), transposed.
+  /// for a change of coordinates and frames: the transpose of pull_back_change().
   void push_forward_change(const double* points,
                            const double* change,
                            const double* g,
@@ -119,7 +119,7 @@ class Mechanisms {
   void visit_curvature(const double* points, const double* g, Visit&& visit) const;
 
   /// Attachments of all surfaces' vertices, points from `first_point` on, to the free nodes, rows from
-  /// `first_row` on. Their Jacobians are still to be filled in.
+  /// `first_row` on. The Jacobians are zero until differentiate().
   linalg::Attachments attachments(Index first_point, Index first_row) const;
 
   /// Fill in the Jacobians at a configuration.
@@ -131,22 +131,22 @@ class Mechanisms {
   /// Largest turn of any link between two configurations, roots included, summed along its chain.
   double turn_between(const double* from, const double* to) const;
 
-  /// Length that turns a change of a coordinate into one of the links' points [m], 1 for shifts; one
-  /// for each number of the nodes, zero where there is no coordinate.
+  /// Lever of each coordinate: length that converts its change to a displacement of the links' points
+  /// [m], 1 for shifts; one for each number of the nodes, zero for numbers without a coordinate.
   const std::vector<double>& lever() const { return lever_; }
 
  private:
   struct Tree {
-    Index given;  // place among all trees
+    Index given;  // index among all trees
     bool free;
     Index first_link, last_link;
     Index first_coordinate, last_coordinate;
     Index first_node, last_node;
-    Index frame;  // first of its four nodes among all points
+    Index frame;  // index of the first of its four nodes among all points
     std::vector<Index> surfaces;
   };
   struct Surface {
-    Index tree = -1;  // among trees_; -1: not of these
+    Index tree = -1;  // index in trees_; -1: none of these
     Index link = -1;
     bool dynamic = false;
     bool collides = false;
@@ -164,7 +164,8 @@ class Mechanisms {
                             const std::vector<Mat34>& moment) const;
   Eigen::MatrixXd curvature(const Tree& tree, const double* points, const double* g) const;
 
-  /// What the constructor fills, in this order; the first gives the tree here of each given one, or -1.
+  /// Steps of the constructor, in this order. make_trees() returns the index in trees_ of each given
+  /// tree, or -1.
   std::vector<Index> make_trees();
   void assign_slots(const Tree& tree);
   void make_paths();
@@ -175,7 +176,7 @@ class Mechanisms {
   std::vector<double> vertices_;
   std::vector<Tree> trees_;
   std::vector<Surface> surface_;
-  std::vector<std::vector<Index>> path_;  // [links] joints that move it, root first
+  std::vector<std::vector<Index>> path_;  // [links] joints that move the link, root first
   std::vector<Index> slot_;
   std::vector<char> node_prescribed_;
   std::vector<double> lever_;

@@ -14,7 +14,7 @@
 
 namespace diffcloth::bodies {
 
-/// The effort of a drive that asks for `asked`: see diffcloth_torch/dynamics/robots.py.
+/// Effort of a drive from which `asked` is requested: see diffcloth_torch/dynamics/robots.py.
 template <class T>
 T limited_effort(const T& asked, const T& limit) {
   using std::sqrt;
@@ -29,16 +29,16 @@ T limited_effort(const T& asked, const T& limit) {
 template <class T>
 struct Drive {
   T stiffness, damping, viscosity, position, velocity;
-  T asked;    // constant effort over the whole step that is asked for
-  T applied;  // the part of it that is within the limit
-  T limit;    // of pd drives
+  T asked;    // requested constant effort over the whole step
+  T applied;  // the requested effort after limiting
+  T limit;    // limit of pd drives
 
   T effort(const T& start, const T& end, double dt) const {
     return asked + stiffness * (position - end) + damping * (velocity - (end - start) / T(dt));
   }
 };
 
-/// What both functions have of a robot.
+/// Members common to both functions of a robot.
 class Robot {
  public:
   explicit Robot(const RobotModel& model)
@@ -49,7 +49,7 @@ class Robot {
     for (Index j = 0; j < joints; ++j) is_forced_.push_back(is_drive(j) || is_torque(j) ? 1 : 0);
     has_forced_ = std::ranges::count(is_forced_, 1) > 0;
     has_prescribed_ = std::ranges::count(is_forced_, 0) > 0;
-    // Without joints, nobody needs the efforts that hold a prescribed base.
+    // Without joints, the efforts that hold a prescribed base are not needed.
     has_dynamics_ = is_dynamic() || joints > 0;
     for (Index i = floats_ ? 0 : kRoot; i < kRoot + joints; ++i) {
       if (i < kRoot || is_forced_[i - kRoot] != 0) solved_.push_back(i);
@@ -57,7 +57,7 @@ class Robot {
   }
 
  protected:
-  /// Names of inputs that both functions have; those that only one has stand behind them.
+  /// Indices of the inputs common to both functions; they precede the inputs of one function.
   enum RobotInput : std::uint8_t {
     kMass,
     kCenter,
@@ -93,8 +93,7 @@ class Robot {
         {"joints", {J}}};
   }
 
-  /// Masses and inertias that count, which leave out the drives of prescribed joints; `armature` is
-  /// to live as long.
+  /// Masses and inertias, without the armature of prescribed joints; `armature` must outlive the result.
   template <class T>
   TreeInertia<T> acting(SmoothFunction::Inputs<T> in, std::vector<T>& armature) const {
     for (Index j = 0; j < joint_count(); ++j) {
@@ -123,8 +122,8 @@ class Robot {
         drive.velocity = in[kTargetRates][j];
       }
       if (is_forced_[j] != 0 && in[kEffortLimits] != nullptr) {
-        // What is applied to a joint without a drive has its limit here. A drive has it for all that
-        // it asks for; the prediction takes what alone would be within.
+        // An effort applied to a joint without a drive is limited here. For a drive the limit applies to
+        // its total effort, in the joint term; the prediction uses the constant part after limiting.
         drive.applied = limited_effort<T>(drive.asked, in[kEffortLimits][j]);
         if (is_drive(j)) {
           drive.limit = in[kEffortLimits][j];
@@ -137,10 +136,10 @@ class Robot {
     return result;
   }
 
-  /// Where the root's center of mass and the joints are.
+  /// Center of mass and orientation of the root, and values of the joints, at the start.
   template <class T>
   struct Start {
-    Vector3<T> back;  // from the center to the origin of the frame of the root, in its axes
+    Vector3<T> back;  // from the center to the origin of the root's frame, in its axes
     Vector3<T> center;
     Quaternion4<T> quaternion;
     Configuration<T> configuration;
@@ -163,7 +162,7 @@ class Robot {
     return place<T>(model_.tree, inertia, at.rotation, at.joints);
   }
 
-  /// Momentum and slope of velocities at the middle of the step.
+  /// Momentum and slope at the middle of the step.
   template <class T>
   TreeRates<T> middle(const TreeInertia<T>& inertia,
                       const Configuration<T>& start,
@@ -175,7 +174,7 @@ class Robot {
   template <class T>
   VectorX<T> of_vertices(const std::vector<PlacedBody<T>>& placed, const T* forces) const {
     std::vector<Wrench<T>> wrenches(placed.size());
-    // Of each link, sum of f v^T over the places v in its frame.
+    // For each link, sum of f v^T over the positions v in its frame.
     std::vector<Matrix3<T>> moments(placed.size(), Matrix3<T>::Zero());
     for (std::size_t v = 0; v < model_.vertex_link.size(); ++v) {
       const Index l = model_.vertex_link[v];

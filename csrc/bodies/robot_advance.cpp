@@ -1,4 +1,4 @@
-// The state of a robot after a step that is solved: see diffcloth_torch/dynamics/robots.py.
+// State of a robot after the solve of a step: see diffcloth_torch/dynamics/robots.py.
 
 #include <algorithm>
 
@@ -84,10 +84,10 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     return {{"pose", {7}}, {"velocity", {6}}, {"rates", {J}}, {"efforts", {J}}};
   }
 
-  /// Force and torque at the root for which the solve moved it from the prediction: minus the gradient of all that
-  /// acts on the surfaces of the robot, contact and attachments, at a minimizer. What the tolerance leaves of the
-  /// residual is part of it, as velocities by momentum are then those by places; forces of contact would have it
-  /// times their stiffness.
+  /// Force and torque on the root that moved it from the prediction in the solve: at a minimizer, minus
+  /// the gradient of all potentials on the surfaces of the robot, contact and attachments. The residual
+  /// left by the tolerance is included, so that velocities from momentum agree with velocities from
+  /// positions; contact forces would contain the residual times their stiffness.
   template <class T>
   VectorX<T> on_root(Inputs<T> in) const {
     const Index n = coordinate_count();
@@ -102,7 +102,8 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     return force;
   }
 
-  /// Velocities nu at the end of a step, from those over it; puts the efforts that held joints.
+  /// Velocities nu at the end of a step, from the mean velocities over it; also writes the efforts that
+  /// held joints.
   template <class T>
   VectorX<T> last_velocity(Inputs<T> in,
                            const TreeInertia<T>& inertia,
@@ -120,8 +121,8 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
       const VectorX<T> momentum = rates<T>(model_.tree, inertia, placed, over).momentum;
       VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
       if (floats_ && !model_.is_at_rest) {
-        // Of the whole robot, which what joints exert on each other gives none. The angular momentum is about a
-        // center that moves past the momentum.
+        // Momentum change of the whole robot, to which internal forces of joints do not contribute. The
+        // angular momentum is about the root's center, which moves: hence the cross product.
         VectorX<T> outside = vector(in[kGiven], kRoot) + T(h) * on_root(in);
         const Vector3<T> linear = outside.template head<3>();
         const Vector3<T> velocity = over.template head<3>();

@@ -1,4 +1,4 @@
-// A robot over a step without contact and limits: see diffcloth_torch/dynamics/robots.py.
+// Motion of a robot over a step without contact and limits: see diffcloth_torch/dynamics/robots.py.
 
 #include <algorithm>
 #include <array>
@@ -12,12 +12,12 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// Turn in a step [rad] beyond which a motion over it is not the only one, and energy is not kept.
+/// Rotation in a step [rad] beyond which the motion is not unique, and energy is not conserved.
 constexpr double kMostTurn = std::numbers::pi;
-/// Turn in a step [rad] that a fall must exceed to count as one.
+/// Rotation in a step [rad] below which a fall is ignored.
 constexpr double kLittleTurn = 1e-6;
 
-/// The equation of a motion with the same numbers of another type, all of them constants.
+/// Equation of a motion with the same values in another number type, all of them constants.
 template <class T>
 class Constants {
  public:
@@ -62,7 +62,7 @@ class Constants {
   FreeMotion<T> motion_;
 };
 
-/// Velocities without contact, and whether they were found.
+/// Velocities without contact; is_lost is true if none were found.
 template <class T>
 struct FoundMotion {
   VectorX<T> nu;
@@ -73,7 +73,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
  public:
   explicit RobotPrediction(const RobotModel& model)
       : TemplatedFunction(inputs_of(model), outputs_of(model)), Robot(model) {
-    // Joints whose fall turns links. What floats falls as a whole, without turning.
+    // Joints that rotate links in a fall. A floating robot falls as a whole, without rotation.
     for (const Link& link : model.tree.links) {
       if (turns(link) && !floats_) turning_.push_back(kRoot + link.coordinate);
     }
@@ -213,7 +213,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     return link.kind.turn != 0.0 && is_forced_[link.coordinate] != 0;
   }
 
-  /// Coordinates at the start, those that are prescribed at the end, and frames of the root.
+  /// Write coordinates at the start, prescribed coordinates at the end, and frames of the root.
   template <class T>
   void put_places(Inputs<T> in,
                   const Start<T>& start,
@@ -265,7 +265,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     metric += stiffness(model_.tree, mass, numbers, gravity).bottomRightCorner(n, n).cast<T>();
   }
 
-  /// nu where it is prescribed, zero elsewhere.
+  /// nu in prescribed rows, zero elsewhere.
   template <class T>
   VectorX<T> prescribed(Inputs<T> in, const Start<T>& start) const {
     VectorX<T> known = VectorX<T>::Zero(size());
@@ -331,7 +331,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     }
   }
 
-  /// dr/dx of an equation of constants.
+  /// Jacobian dr/dx of an equation whose inputs are constants.
   static Eigen::MatrixXd jacobian(const FreeMotion<Recorded>& motion, const Eigen::VectorXd& x) {
     Recording recording;
     const Recorder recorder(recording);
@@ -349,7 +349,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     return K;
   }
 
-  /// Whether a floating base and all joints make less than half a turn by themselves; not if one is NaN.
+  /// True if a floating base and all joints make less than half a turn in free motion; false for NaN.
   bool is_resolved(const Eigen::VectorXd& nu) const {
     const double most = kMostTurn / model_.dt;
     if (floats_ && !(nu.segment<3>(3).norm() <= most)) return false;
@@ -358,16 +358,17 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     });
   }
 
-  /// Make M balance the forces on a robot that stays at rest.
+  /// Change M such that it balances the forces on a robot that stays at rest.
   ///
-  /// By itself a robot moves by velocities d of its s unknown ones. One that something holds should
-  /// lack the impulse y that would let it, but M d has the velocity products of a fall that does not
-  /// happen: M d = y - e. The symmetric change U of rank two,
+  /// Without contact the robot moves with velocities d in its s unknown rows. If contact holds it at
+  /// rest, the impulse that M d lacks should be the impulse y of the forces; but M d includes the
+  /// velocity products of a fall that does not happen: M d = y - e. The symmetric change U of rank two,
   ///
   ///   U = (e w^T + w e^T) / k - (e . d) w w^T / k^2,   w = M d,  k = d . w,
   ///
-  /// gives (M + U) d = y, and changes nothing across d and M^-1 e. It counts by the share of the
-  /// kinetic energy that one step of the forces gives: a robot that moves has such products.
+  /// satisfies (M + U) d = y, and U v = 0 for all v that are M-orthogonal to d and M^-1 e. U is scaled
+  /// by the fraction of the kinetic energy that one step of the forces adds, because the velocity
+  /// products of a moving robot are real.
   template <class T>
   void add_change_at_rest(Inputs<T> in,
                           const TreeInertia<T>& inertia,
@@ -386,7 +387,8 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     const VectorX<T> d = pick<T>(nu, solved_);
     const VectorX<T> w = M * d;
     const VectorX<T> e = pick<T>(needed, solved_) - w;
-    // Twice kinetic energies: of the fall, of what a step of the forces adds, and of the motion.
+    // Twice the kinetic energies: of the fall, of the change by one step of the forces, and of the
+    // motion.
     const VectorX<T> before = velocity(in);
     VectorX<T> now = known;
     for (const Index i : solved_) now[i] = before[i];
@@ -413,8 +415,8 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     }
   }
 
-  /// Add drives, viscosity and a constant force to 1/2 (q - q^)^T A (q - q^), giving
-  /// 1/2 (q - t)^T A (q - t), with t in the place of q^.
+  /// Add drives, viscosity and a constant force to 1/2 (q - q^)^T A (q - q^), which results in 1/2 (q -
+  /// t)^T A (q - t); `predicted` is q^ before and t after.
   template <class T>
   void fold(const std::vector<Drive<T>>& drives,
             const T* start,
@@ -434,14 +436,14 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
       metric(first + j, first + j) += drive.stiffness + (drive.damping + drive.viscosity) / T(h);
     }
     std::vector<Index> unknown = solved_;
-    for (Index& i : unknown) i -= size() - coordinate_count();  // among the coordinates
+    for (Index& i : unknown) i -= size() - coordinate_count();  // indices among the coordinates
     const VectorX<T> shift = solve(pick<T>(metric, unknown), pick<T>(pull, unknown));
     for (std::size_t i = 0; i < unknown.size(); ++i) {
       predicted[unknown[i]] -= shift[static_cast<Index>(i)];
     }
   }
 
-  /// Rows of the core's joint terms; it ignores those of prescribed joints.
+  /// Write the rows of the core's joint terms; rows of prescribed joints are ignored.
   template <class T>
   void put_terms(Inputs<T> in, const std::vector<Drive<T>>& drives, T* rows) const {
     const Index first = coordinate_count() - joint_count();

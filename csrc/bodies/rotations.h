@@ -1,7 +1,7 @@
 #pragma once
 
-// Rotations as quaternions (w, x, y, z), of doubles or of recorded numbers; smooth at zero. Their
-// formulas are those of diffcloth_torch/geometry/rotation.py.
+// Rotations as quaternions (w, x, y, z), of doubles or of recorded numbers; smooth at zero. The formulas
+// are the same as in diffcloth_torch/geometry/rotation.py.
 
 #include <cmath>
 
@@ -18,14 +18,14 @@ using Matrix3 = Eigen::Matrix<T, 3, 3>;
 template <class T>
 using Quaternion4 = Eigen::Matrix<T, 4, 1>;
 
-/// Below this angle [rad] the exponential is summed as a series; its first neglected terms are
-/// 0.1^10 / (2^10 10!) = 3e-20 for the cosine and less for the sine.
+/// Angle [rad] below which the exponential is summed as a series; its first neglected terms are 0.1^10 /
+/// (2^10 10!) = 3e-20 for the cosine and less for the sine.
 inline constexpr double kSeriesAngle = 0.1;
 
-/// sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
+/// Bound of sin(a / 2) below which a logarithm uses a / sin(a / 2) = 2, accurate to rounding.
 inline constexpr double kSmallestSine = 1e-9;
 
-/// Of a rotation vector w [rad]: (cos(a/2), sin(a/2)/a w) with a = |w|.
+/// Exponential of a rotation vector w [rad]: (cos(a/2), sin(a/2)/a w) with a = |w|.
 template <class T>
 Quaternion4<T> quaternion_exp(const Vector3<T>& w) {
   using std::cos;
@@ -47,7 +47,7 @@ Quaternion4<T> quaternion_exp(const Vector3<T>& w) {
   return {cosine, half_sine * w[0], half_sine * w[1], half_sine * w[2]};
 }
 
-/// Rotation vector [rad] of a unit quaternion, of at most pi.
+/// Rotation vector [rad] of a unit quaternion, at most pi long.
 template <class T>
 Vector3<T> quaternion_log(const Quaternion4<T>& q) {
   using std::atan2;
@@ -83,7 +83,7 @@ Quaternion4<T> normalized(const Quaternion4<T>& q) {
   return {q[0] / length, q[1] / length, q[2] / length, q[3] / length};
 }
 
-/// q or -q, which are one rotation: the one nearer to `other`.
+/// q or -q, which represent the same rotation: the one nearer to `other`.
 template <class T>
 Quaternion4<T> nearer_quaternion(const Quaternion4<T>& q, const Quaternion4<T>& other) {
   if (q.dot(other) < T(0.0)) return -q;
@@ -103,8 +103,8 @@ Matrix3<T> quaternion_matrix(const Quaternion4<T>& q) {
   return R;
 }
 
-/// Torque J(w)^-T Q that does the work of a generalized force Q on a rotation vector w, shorter than
-/// 2 pi: Q + w x Q / 2 + b w x (w x Q) with b = (1 - (a/2) cot(a/2)) / a^2 and a = |w|.
+/// Torque J(w)^-T Q that does the work of a generalized force Q on a rotation vector w shorter than 2
+/// pi: Q + w x Q / 2 + b w x (w x Q) with b = (1 - (a/2) cot(a/2)) / a^2 and a = |w|.
 template <class T>
 Vector3<T> torque_from_moment(const Vector3<T>& w, const Vector3<T>& moment) {
   using std::cos;
@@ -125,7 +125,7 @@ Vector3<T> torque_from_moment(const Vector3<T>& w, const Vector3<T>& moment) {
   return moment + turned / T(2.0) + b * w.cross(turned);
 }
 
-/// Rotation vector [rad] of the turn from one unit quaternion to another.
+/// Rotation vector [rad] from one unit quaternion to another.
 template <class T>
 Vector3<T> turn_between(const Quaternion4<T>& from, const Quaternion4<T>& to) {
   return quaternion_log<T>(quaternion_multiply<T>(to, conjugate<T>(from)));

@@ -26,13 +26,12 @@ MatrixX<T> pick(const MatrixX<T>& values, const std::vector<Index>& rows) {
   return picked;
 }
 
-/// The x with M x = v.
+/// Solution x of M x = v.
 inline Eigen::VectorXd solve(const Eigen::MatrixXd& M, const Eigen::VectorXd& v) {
   return M.partialPivLu().solve(v);
 }
 
-/// A point x with the derivative -K^-1 dr, of which r = 0 is known to hold at x: that of a root of r,
-/// however it was found, where K is dr/dx.
+/// Point x with the derivative -K^-1 dr, for a known root x of r = 0, however it was found; K is dr/dx.
 inline VectorX<Recorded> with_derivative(const Eigen::VectorXd& x,
                                          const Eigen::MatrixXd& K,
                                          const VectorX<Recorded>& r) {
@@ -40,7 +39,7 @@ inline VectorX<Recorded> with_derivative(const Eigen::VectorXd& x,
   VectorX<Recorded> result(x.size());
   for (Eigen::Index i = 0; i < x.size(); ++i) {
     result[i] = x[i];
-    // Adds zero.
+    // The added value is zero; only the derivatives are recorded.
     for (Eigen::Index j = 0; j < x.size(); ++j) result[i] -= inverse(i, j) * (r[j] - r[j].value);
   }
   return result;

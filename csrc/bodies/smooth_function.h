@@ -12,7 +12,7 @@
 
 namespace diffcloth::bodies {
 
-/// A function of arrays of numbers, whose derivatives follow from a recording of its operations.
+/// Function of arrays of numbers, whose derivatives are computed by recording its operations.
 class SmoothFunction {
  public:
   struct Array {
@@ -28,7 +28,7 @@ class SmoothFunction {
     }
   };
 
-  /// The arrays of one environment; null where an optional one is not given.
+  /// Arrays of one environment; null for an optional one that is missing.
   template <class T>
   using Inputs = std::span<const T* const>;
   template <class T>
@@ -50,23 +50,23 @@ class SmoothFunction {
   std::vector<Array> inputs_, outputs_;
 };
 
-/// A function where it has been evaluated, with the derivatives by some of its inputs.
+/// A function evaluated at a point, with the derivatives by some of its inputs.
 class Linearized {
  public:
-  /// @param varies  [inputs] which are variables; the others are constants
+  /// @param varies  [inputs] nonzero for variables; the others are constants
   Linearized(const SmoothFunction& function,
              SmoothFunction::Inputs<double> in,
              const std::vector<char>& varies);
 
-  /// Gradients by the variables, one array after the other, from cotangents of the outputs likewise.
+  /// Gradients by the variables, array by array, from cotangents of the outputs.
   ///
-  /// @param cotangents  [outputs]; null where zero
+  /// @param cotangents  [outputs]; null: zero
   /// @param gradients   [inputs]; null for constants
   void pull_back(std::span<const double* const> cotangents, std::span<double* const> gradients);
 
-  /// Tangents of the outputs from those of the variables.
+  /// Tangents of the outputs from tangents of the variables.
   ///
-  /// @param given     [inputs]; null where zero
+  /// @param given     [inputs]; null: zero
   /// @param tangents  [outputs]
   void push_forward(std::span<const double* const> given, std::span<double* const> tangents);
 
@@ -75,7 +75,7 @@ class Linearized {
   const std::vector<char>& varies_;
   Recording recording_;
   std::vector<std::vector<Recorded>> outputs_;
-  std::vector<double> change_;  // of each result, or by it
+  std::vector<double> change_;  // tangents or cotangents of the recorded results
 };
 
 }  // namespace diffcloth::bodies

@@ -41,7 +41,7 @@ Eigen::Matrix<T, 4, 1> vector4(const T* numbers) {
   return {numbers[0], numbers[1], numbers[2], numbers[3]};
 }
 
-/// From rows.
+/// From row-major numbers.
 template <class T>
 Matrix3<T> matrix3(const T* numbers) {
   return Eigen::Map<const Eigen::Matrix<T, 3, 3, Eigen::RowMajor>>(numbers);
@@ -53,8 +53,8 @@ Quaternion4<T> orientation(const T* pose) {
   return normalized<T>(vector4(pose + 3));
 }
 
-/// A vector and its negative, as results of their own: what goes back to both cancels to the last bit
-/// where they are turned alike, as it would not one number after the other.
+/// A vector and its negative, as separate recorded results: cotangents of the two are accumulated
+/// separately, and cancel to the last bit if both vectors are rotated alike.
 template <class T>
 std::pair<Vector3<T>, Vector3<T>> both_ways(const Vector3<T>& v) {
   return {T(1.0) * v, -v};

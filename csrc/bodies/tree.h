@@ -1,18 +1,18 @@
 #pragma once
 
-// Momenta and forces of a tree of links in the velocities nu = (dc/dt, omega, dq/dt) of its root and
-// its joints: recursions along the tree, of doubles or of recorded numbers.
+// Momenta and forces of a tree of links in terms of the velocities nu = (dc/dt, omega, dq/dt) of its
+// root and its joints: recursions along the tree, of doubles or of recorded numbers.
 //
-// With the 6 velocities V_l = J_l nu of each link, those of its center and of rotation, and its mass
-// and inertia W_l in world axes,
+// With the 6 velocities V_l = J_l nu of each link (of its center and of rotation), and its mass and
+// inertia W_l in world axes,
 //
 //   M = sum_l J_l^T W_l J_l,   p = M nu.
 //
-// All twists, momenta and forces are about the root's center of mass c: motion far from the origin of
-// the world has the same rounding. Let h be the momentum of all links that joint j carries, S_j the
-// twist of the joint and V_j the velocity of its link. Then p_j = S_j . h. A change of the coordinate
-// moves all links that the joint carries and no others, so the kinetic energy T = p . nu / 2 grows
-// with it, at constant rates, by
+// All twists, momenta and forces are about the root's center of mass c, so that rounding does not grow
+// with the distance from the world's origin. Let h be the momentum of all links that joint j carries,
+// S_j the twist of the joint and V_j the velocity of its link. Then p_j = S_j . h. A change of the
+// coordinate moves all links that the joint carries and no others, so the kinetic energy T = p . nu / 2
+// grows with it, at constant rates, by
 //
 //   dT/dq_j = (rate of S_j as it moves with V_j) . h.
 //
@@ -31,14 +31,14 @@
 
 namespace diffcloth::bodies {
 
-inline constexpr Index kRoot = 6;  ///< velocities of the root, which come first
+inline constexpr Index kRoot = 6;  ///< number of velocities of the root, which come first
 
 template <class T>
 using VectorX = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 template <class T>
 using MatrixX = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 
-/// Links of one mechanism, in any order; a coordinate is the place of a joint among the J.
+/// Links of one mechanism, in any order; a coordinate is the index of a joint among the J.
 struct Tree {
   std::vector<Link> links;
   std::vector<Index> order;  ///< parents before their children
@@ -106,7 +106,7 @@ TreeRates<T> rates(const Tree& tree,
                    const std::vector<PlacedBody<T>>& placed,
                    const VectorX<T>& nu) {
   std::vector<Twist<T>> velocity(placed.size());
-  std::vector<Wrench<T>> momentum(placed.size());  // of all that a link carries, itself included
+  std::vector<Wrench<T>> momentum(placed.size());  // of all links carried, including itself
   for (const Index l : tree.order) {
     const Link& link = tree.links[l];
     const PlacedBody<T>& p = placed[l];
@@ -150,7 +150,8 @@ TreeRates<T> rates(const Tree& tree,
   return out;
 }
 
-/// sum_l J_l^T f_l of wrenches on the links. `wrenches` then hold the sums over all that a link carries.
+/// sum_l J_l^T f_l of wrenches on the links. Afterwards `wrenches` holds the sums over all links that
+/// each link carries.
 template <class T>
 VectorX<T> generalized_force(const Tree& tree,
                              const std::vector<PlacedBody<T>>& placed,
@@ -170,14 +171,14 @@ VectorX<T> generalized_force(const Tree& tree,
   return out;
 }
 
-/// M with the armature on its diagonal, from the inertia of all that each joint carries.
+/// M with the armature on its diagonal, from the inertia of all links that each joint carries.
 template <class T>
 MatrixX<T> mass_matrix(const Tree& tree,
                        const TreeInertia<T>& inertia,
                        const std::vector<PlacedBody<T>>& placed) {
   struct Carried {
     T mass = 0.0;
-    Vector3<T> first = Vector3<T>::Zero();   // sum of mass times place
+    Vector3<T> first = Vector3<T>::Zero();   // sum of mass times position
     Matrix3<T> second = Matrix3<T>::Zero();  // inertia about c
   };
   std::vector<Carried> carried(placed.size());
@@ -201,7 +202,7 @@ MatrixX<T> mass_matrix(const Tree& tree,
         const int j = (i + 1) % 3;
         const int k = (i + 2) % 3;
         M(i, i) = own.mass;
-        // The momentum omega x h of a turn.
+        // Momentum omega x h of a rotation.
         M(j, 3 + i) = M(3 + i, j) = -h[k];
         M(k, 3 + i) = M(3 + i, k) = h[j];
       }
@@ -212,7 +213,7 @@ MatrixX<T> mass_matrix(const Tree& tree,
     above.first += own.first;
     above.second += own.second;
     if (!link.moves()) continue;
-    // Momentum of all that the joint carries when it alone moves, at unit speed.
+    // Momentum of all links that the joint carries, when only this joint moves, at unit rate.
     const Twist<T>& joint = p.joint;
     Wrench<T> momentum;
     momentum.force = own.mass * joint.linear + joint.angular.cross(own.first);

@@ -6,9 +6,9 @@
 
 namespace diffcloth::bodies {
 
-// By joint i and by joint j, which joint i carries or is, d2V = -(angular_i x P_j) . g, where P_j is the
-// momentum of all that joint j carries at a unit rate of its coordinate. The root's rotation vector w
-// carries everything:
+// By joints i and j, where joint i carries joint j or i = j, d2V = -(angular_i x P_j) . g, where P_j is
+// the momentum of all links that joint j carries at a unit rate of its coordinate. The root's rotation
+// vector w carries everything:
 //
 //   d2V/dw dw = (g . h) 1 - (g h^T + h g^T) / 2,   h = sum_l m_l (c_l - c).
 MatrixX<double> weight_stiffness(const Tree& tree,
@@ -17,7 +17,7 @@ MatrixX<double> weight_stiffness(const Tree& tree,
                                  const Vec3& gravity) {
   struct Carried {
     double mass = 0.0;
-    Vec3 first = Vec3::Zero();  // sum of mass times place
+    Vec3 first = Vec3::Zero();  // sum of mass times position
   };
   std::vector<Carried> carried(placed.size());
   MatrixX<double> K = MatrixX<double>::Zero(tree.size(), tree.size());
@@ -55,11 +55,11 @@ MatrixX<double> weight_stiffness(const Tree& tree,
 
 namespace {
 
-/// A coordinate of the root or a joint, as it moves the center of one link.
+/// A coordinate of the root or a joint, with its effect on the center of one link.
 struct Mover {
   Index coordinate;
-  double turn;   // angle by a unit of the coordinate
-  double slide;  // shift by it
+  double turn;   // angle per unit of the coordinate
+  double slide;  // shift per unit of the coordinate
   double way;    // from the axis to the center, along the links between [m]
 };
 

@@ -11,9 +11,8 @@ namespace {
 
 #ifdef DIFFCLOTH_HAS_CHOLMOD
 
-/// The library that dgemm resolves to in this process, with OpenBLAS' own description of itself.
-/// It is the loader's choice, not the build's: an alternative of the system, or a copy that
-/// another package loaded before.
+/// Library that provides dgemm in this process, with OpenBLAS' own description. The loader chooses it at
+/// run time: a system alternative, or a copy that another package loaded before.
 std::string blas() {
   void* const dgemm = dlsym(RTLD_DEFAULT, "dgemm_");
   Dl_info library{};

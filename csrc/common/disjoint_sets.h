@@ -9,7 +9,7 @@
 
 namespace diffcloth {
 
-/// Sets of 0 .. size - 1, each named by its lowest member.
+/// Disjoint sets of 0 .. size - 1, each represented by its lowest member.
 class DisjointSets {
  public:
   explicit DisjointSets(std::size_t size) : parent_(size) {

@@ -4,8 +4,8 @@
 
 namespace diffcloth {
 
-/// Numbers in [-0.5, 0.5) without any pattern, the same in every run: for vectors that share no symmetry
-/// with a scene.
+/// Pseudo-random numbers in [-0.5, 0.5), identical in every run: for vectors that share no symmetry with
+/// a scene.
 class FixedNoise {
  public:
   double operator()() {

@@ -8,8 +8,8 @@
 
 namespace diffcloth {
 
-/// While it lives, numbers too small for full precision are zero to this thread: arithmetic with them
-/// takes many times as long on some processors. Where the processor has no such mode it does nothing.
+/// Scope in which subnormal numbers are flushed to zero in this thread: arithmetic with them is many
+/// times slower on some processors. No effect on processors without such a mode.
 class FlushSubnormals {
  public:
   FlushSubnormals() : before_(get()) { set(before_ | kFlags); }

@@ -9,8 +9,8 @@ namespace diffcloth {
 ///   f2   = (f1' y - f1) / y^3 = -1 / (y e^2)                -1 / y^3
 ///
 /// mu lambda f0 is the dissipation potential, mu lambda (f1/y) w the force that opposes the slip w,
-/// and mu lambda ((f1/y) I + f2 w w^T) its derivative by w. f2 w w^T vanishes with y, so that f2 is
-/// returned as 0 where it would overflow.
+/// and mu lambda ((f1/y) I + f2 w w^T) its derivative by w. f2 w w^T vanishes with y: f2 is
+/// returned as 0 if it would overflow.
 struct FrictionLaw {
   double f0;
   double f1_over_y;

@@ -6,18 +6,18 @@
 
 namespace diffcloth {
 
-/// Thrown to unwind a call that the user has interrupted. The caller's poll knows the reason.
+/// Thrown to unwind a call that the user interrupted. The caller's poll records the reason.
 struct Interrupted {};
 
-/// Lets a long computation be interrupted: call check() often.
+/// Interrupt of a long computation, which must call check() often.
 ///
-/// One instance is shared by the threads of a call. `poll` is called on the thread that made the
-/// call only, at most every 50 ms, and returns true to stop everybody.
+/// One instance is shared by the threads of a call. `poll` is called only on the thread that made the
+/// call, at most every 50 ms, and returns true to stop all threads.
 class Interrupt {
  public:
   explicit Interrupt(std::function<bool()> poll) : poll_(std::move(poll)) {}
 
-  /// To be called by the thread that made the call.
+  /// Must be called on the thread that made the call.
   void poll() {
     const auto now = std::chrono::steady_clock::now();
     if (now - last_ < std::chrono::milliseconds(50)) return;
@@ -33,7 +33,7 @@ class Interrupt {
   std::atomic<bool> stopped_{false};
 };
 
-/// Thrown to unwind a step whose time is up, to where it can end.
+/// Thrown to unwind a step after its deadline, to the point at which it can end.
 struct TimeIsUp {};
 
 /// View of an Interrupt for one worker, with the deadline of a step.
@@ -42,9 +42,9 @@ class Checkpoint {
   Checkpoint(Interrupt& interrupt, bool is_caller)
       : interrupt_(&interrupt), is_caller_(is_caller) {}
 
-  /// Copy with a deadline that many seconds from now; none where the number is infinite.
+  /// Copy with a deadline `seconds` from now; none if infinite.
   Checkpoint with_seconds(double seconds) const {
-    constexpr double kForever = 1e9;  // beyond what the clock counts
+    constexpr double kForever = 1e9;  // beyond the range of the clock
     Checkpoint other = *this;
     if (seconds < kForever) {
       const std::chrono::duration<double> left(seconds);
@@ -67,7 +67,7 @@ class Checkpoint {
 
   bool is_late() const { return deadline_ < kNever && Clock::now() > deadline_; }
 
-  /// Remove the deadline that has passed, so that the step can end in order; solves do not go on.
+  /// Remove the expired deadline, so that the step can end in order; solves do not continue.
   void stop_clock() {
     deadline_ = kNever;
     is_up_ = true;

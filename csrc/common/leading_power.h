@@ -4,7 +4,7 @@
 
 namespace diffcloth {
 
-/// The largest power of two up to a: to divide by without rounding. One where a is zero or not finite.
+/// Largest power of two up to a, for division without rounding; 1 if a is zero or not finite.
 inline double leading_power(double a) {
   return a > 0.0 && std::isfinite(a) ? std::ldexp(1.0, std::ilogb(a)) : 1.0;
 }

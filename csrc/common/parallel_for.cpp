@@ -18,18 +18,18 @@ namespace diffcloth {
 
 namespace {
 
-/// Whether a new thread has memory to begin with, of which it takes what its exceptions will need: a
-/// lack of that later would end the process instead of raising an error.
+/// True if a new thread can allocate memory. The test also reserves the memory that its exceptions will
+/// need: a failure there would terminate the process instead of raising an error.
 bool take_memory() {
   constexpr std::size_t kBytes = std::size_t{1} << 18;
-  void* volatile probe = std::malloc(kBytes);  // volatile: or it would be optimized away
+  void* volatile probe = std::malloc(kBytes);  // volatile, to prevent optimization
   if (probe == nullptr) return false;
   std::free(probe);
   return std::uncaught_exceptions() == 0;
 }
 
-/// Waits until no thread beside the caller is running. The caller alone can see an interrupt, so it
-/// keeps looking while others work.
+/// Wait until no other thread is running. Only the caller can detect an interrupt, so it keeps polling
+/// while others work.
 void wait_for_others(const int& running,  // guarded by the mutex
                      std::mutex& mutex,
                      std::condition_variable& finished,
@@ -86,7 +86,7 @@ void parallel_for(Index count,
     finished.notify_one();
   };
 
-  std::vector<std::jthread> pool;  // joined before anything above is gone, whatever happens
+  std::vector<std::jthread> pool;  // joined before the variables above are destroyed
   pool.reserve(static_cast<std::size_t>(workers - 1));
   while (std::ssize(pool) + 1 < workers) {
     {
@@ -96,7 +96,7 @@ void parallel_for(Index count,
     try {
       pool.emplace_back(work_beside_caller);
     } catch (const std::system_error&) {
-      // The system has no more threads to give: those that are there do the work.
+      // The system has no more threads: the existing ones do the work.
       const std::lock_guard lock(mutex);
       --running;
       break;

@@ -4,8 +4,8 @@
 
 namespace diffcloth {
 
-/// Processor time that the calling thread has taken so far [s]. A call takes up to a microsecond: it asks the
-/// system.
+/// Processor time of the calling thread so far [s]. A call takes up to a microsecond, because it is a
+/// system call.
 inline double processor_seconds() {
   timespec t{};
   clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);

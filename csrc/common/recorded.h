@@ -9,30 +9,30 @@
 
 namespace diffcloth {
 
-/// The operations of an evaluation, in their order: what its derivatives need. One derivative costs a
-/// pass over them in either direction, whatever there are of inputs (Griewank and Walther, "Evaluating
+/// Operations of an evaluation, in order, for its derivatives. One derivative costs a pass over the
+/// operations in either direction, for any number of inputs (Griewank and Walther, "Evaluating
 /// Derivatives", 2008).
 class Recording {
  public:
-  /// The one that numbers of this thread are recorded in; null outside of `Recorder`.
+  /// Active recording of this thread; null outside of `Recorder`.
   static Recording*& current() {
     thread_local Recording* recording = nullptr;
     return recording;
   }
 
-  /// Forget all operations, but not the memory for them.
+  /// Remove all operations, but keep their memory.
   void clear() { operations_.assign(1, {}); }
 
-  /// @return the number of a result that changes with two earlier ones at these rates
+  /// @return index of a result with these partial derivatives by two earlier ones
   std::uint32_t add(std::uint32_t a, double rate_a, std::uint32_t b, double rate_b) {
     operations_.push_back({.a = a, .b = b, .rate_a = rate_a, .rate_b = rate_b});
     return static_cast<std::uint32_t>(operations_.size() - 1);
   }
 
-  /// Numbers of results; the first one is that of all constants.
+  /// Number of results; result 0 represents all constants.
   std::size_t size() const { return operations_.size(); }
 
-  /// From derivatives by results, [size], to those by all that they are made from.
+  /// Accumulate cotangents of results, [size], into cotangents of their inputs.
   void pull_back(std::vector<double>& of) const {
     for (std::size_t i = operations_.size() - 1; i > 0; --i) {
       const Operation& by = operations_[i];
@@ -42,7 +42,7 @@ class Recording {
     }
   }
 
-  /// From changes of the first `variables` results, [size], to those of all others.
+  /// Compute tangents of all results, [size], from tangents of the first `variables` ones.
   void push_forward(std::size_t variables, std::vector<double>& of) const {
     of[0] = 0.0;
     for (std::size_t i = 1 + variables; i < operations_.size(); ++i) {
@@ -59,7 +59,7 @@ class Recording {
   std::vector<Operation> operations_{1};
 };
 
-/// While it lives, this thread records in a cleared recording.
+/// Scope in which this thread records into a cleared recording.
 class Recorder {
  public:
   explicit Recorder(Recording& recording) : before_(Recording::current()) {
@@ -74,11 +74,11 @@ class Recorder {
   Recording* before_;
 };
 
-/// A number whose operations are recorded, unless it is a constant. Its value has the bits that a
-/// double would have.
+/// A number whose operations are recorded, unless it is constant. Its value has the same bits as with
+/// double.
 struct Recorded {
   double value = 0.0;
-  std::uint32_t place = 0;  ///< in the recording; 0 for a constant
+  std::uint32_t place = 0;  ///< index in the recording; 0 for a constant
 
   Recorded() = default;
   Recorded(double v) : value(v) {}  // NOLINT(google-explicit-constructor): constants mix in
@@ -87,7 +87,7 @@ struct Recorded {
     return result(v, Recording::current()->add(0, 0.0, 0, 0.0));
   }
 
-  /// f(a), with the slope df/da.
+  /// Result f(a) with the derivative df/da.
   static Recorded of(double f, const Recorded& a, double slope) {
     if (a.place == 0 || slope == 0.0) return f;
     return result(f, Recording::current()->add(a.place, slope, 0, 0.0));
@@ -141,7 +141,7 @@ struct Recorded {
   }
 };
 
-/// The number without its derivatives.
+/// Value without derivatives.
 inline double value_of(double x) { return x; }
 inline double value_of(const Recorded& x) { return x.value; }
 

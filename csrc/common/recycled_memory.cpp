@@ -22,27 +22,28 @@ namespace {
 
 constexpr std::size_t kLine = 64;
 
-/// Arrays of some huge pages begin with one: they take a five hundredth of the page faults, and of the
-/// processor's tables of pages [bytes].
+/// Size of a huge page [bytes]. Arrays of several huge pages are aligned to one: this reduces page
+/// faults, and the size of the page tables, by a factor of five hundred.
 constexpr std::size_t kHugePage = std::size_t{1} << 21;
 constexpr std::size_t kWorthHugePages = 2 * kHugePage;
 
-/// Arrays below are as quick from the allocator, those above too dear to keep [bytes].
+/// Bounds of recycled sizes [bytes]: smaller arrays are as fast from the allocator, larger ones too
+/// expensive to keep.
 constexpr std::size_t kSmallest = std::size_t{1} << 16;
 #ifdef __SANITIZE_ADDRESS__
-constexpr std::size_t kLargest = 0;  // the sanitizer is to see each of them freed
+constexpr std::size_t kLargest = 0;  // the sanitizer must see each of them freed
 #else
 constexpr std::size_t kLargest = std::size_t{1} << 24;
 #endif
 
-/// What is kept at most, of all sizes [bytes].
+/// Bound of the total kept memory [bytes].
 constexpr std::size_t kKept = std::size_t{1} << 25;
 
-/// From here on it is worth the time to look for memory that is free before more is taken [bytes].
+/// Size from which it is worthwhile to return free memory to the system before an allocation [bytes].
 constexpr std::size_t kHuge = std::size_t{1} << 27;
 
-/// Give what is free to the system, where the C library would hold on to it: small arrays, and those of
-/// some megabytes.
+/// Return free memory to the system that the C library would keep: small arrays, and arrays of some
+/// megabytes.
 void return_free_memory() {
 #ifdef __GLIBC__
   malloc_trim(0);
@@ -51,8 +52,8 @@ void return_free_memory() {
 
 bool is_recycled(std::size_t bytes) { return bytes >= kSmallest && bytes <= kLargest; }
 
-/// Up to an eighth more than asked for: contact changes the sizes of matrices a little, and what held
-/// one is to hold the next.
+/// Size rounded up by at most an eighth: contact changes the sizes of matrices slightly, and the memory
+/// of one should fit the next.
 std::size_t rounded(std::size_t bytes) {
   const std::size_t step = std::max(std::bit_floor(bytes) / 8, kLine);
   return (bytes + step - 1) / step * step;
@@ -65,7 +66,7 @@ std::align_val_t alignment(std::size_t bytes) {
 void* allocate(std::size_t bytes) {
   void* const memory = ::operator new(bytes, alignment(bytes));
 #ifdef MADV_HUGEPAGE
-  // Where the system has none it stays as it is.
+  // The call is a hint: it fails without effect if the system has no huge pages.
   if (bytes >= kWorthHugePages) madvise(memory, bytes / kHugePage * kHugePage, MADV_HUGEPAGE);
 #endif
   return memory;
@@ -73,20 +74,20 @@ void* allocate(std::size_t bytes) {
 
 void free(void* memory, std::size_t bytes) noexcept { ::operator delete(memory, alignment(bytes)); }
 
-/// Memory that nobody uses. Who finds it locked goes to the system instead: that is no dearer than to
-/// wait, and in a forked process the lock may belong to a thread that is not there.
+/// Pool of unused memory. A caller that finds it locked uses the system allocator: that costs no more
+/// than to wait, and in a forked process the lock may be held by a thread that does not exist.
 class Unused {
  public:
   void* take(std::size_t bytes) {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return nullptr;
-    for (std::size_t k = count_; k-- > 0;) {  // the last that came is the one that caches remember
+    for (std::size_t k = count_; k-- > 0;) {  // the latest is the likeliest to be cached
       if (blocks_[k].bytes == bytes) return remove(k).memory;
     }
     return nullptr;
   }
 
-  /// Whether it is kept; else it is still the caller's.
+  /// True if the memory was kept; otherwise the caller still owns it.
   bool keep(void* memory, std::size_t bytes) noexcept {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return false;
@@ -114,13 +115,13 @@ class Unused {
   }
 
   std::mutex mutex_;
-  std::array<Block, 256> blocks_;  // in the order in which they came
+  std::array<Block, 256> blocks_;  // in the order of their return
   std::size_t count_ = 0;
   std::size_t bytes_ = 0;
 };
 
 Unused& unused() {
-  static Unused& all = *new Unused;  // never destroyed: arrays may outlive every static object
+  static Unused& all = *new Unused;  // never destroyed: arrays may outlive static objects
   return all;
 }
 
@@ -150,7 +151,7 @@ void* SpareRoom::take(std::size_t bytes) {
     size = std::exchange(bytes_, 0);
   }
   if (size == wanted) return spare;
-  free(spare, size);  // never both at once
+  free(spare, size);  // free the old array first, to limit the peak
   if (wanted >= kHuge) return_free_memory();
   return allocate(wanted);
 }

@@ -8,16 +8,16 @@ namespace diffcloth {
 
 /// Memory for large arrays, aligned to a cache line.
 ///
-/// What is given back is kept for the next array of about its size, up to a bound for the whole
-/// process: the system clears each page that it hands out, and threads, which live for one step only,
-/// would ask for theirs again in every step.
+/// Released memory is kept for later arrays of about the same size, up to a bound for the whole process.
+/// Otherwise the system would clear each new page, and threads, which live for one step only, would
+/// request their pages again in every step.
 void* take_recycled(std::size_t bytes);
 
-/// @param bytes  as they were asked for
+/// @param bytes  the size passed to take_recycled()
 void give_back(void* memory, std::size_t bytes) noexcept;
 
-/// Room for the next of the arrays that are too large for that, while a step goes on: the last one that
-/// was given back. Its owner needed it a moment ago, so the step takes no more memory at any time.
+/// Room for one array beyond the sizes of take_recycled(), during a step: keeps the last one returned.
+/// Its owner has just used it, so the peak memory of the step does not increase.
 class SpareRoom {
  public:
   SpareRoom() = default;
@@ -25,20 +25,20 @@ class SpareRoom {
   SpareRoom(const SpareRoom&) = delete;
   SpareRoom& operator=(const SpareRoom&) = delete;
 
-  /// As take_recycled() and give_back(). May be called from any number of threads.
+  /// Same as take_recycled() and give_back(); thread-safe.
   void* take(std::size_t bytes);
   void give_back(void* memory, std::size_t bytes) noexcept;
 
-  /// What lies there [bytes].
+  /// Size of the kept array [bytes].
   std::size_t bytes() const;
 
  private:
   mutable std::mutex mutex_;
-  void* memory_ = nullptr;  ///< guarded, as is its size
+  void* memory_ = nullptr;  ///< guarded by mutex_, as is bytes_
   std::size_t bytes_ = 0;
 };
 
-/// The same for containers.
+/// Allocator of recycled memory for containers.
 template <typename T>
 struct RecyclingAllocator {
   using value_type = T;

@@ -8,8 +8,7 @@
 
 namespace diffcloth {
 
-/// What the time of a step is reported for. kOther is everything that no other phase claims, so that
-/// the phases add up to the whole.
+/// Phase of a step for timing. kOther is the remainder, so that the phases add up to the total.
 enum class Phase : std::uint8_t {
   kDetection,      ///< broad phase and collision detection
   kAssembly,       ///< contacts, gradients and Hessians
@@ -24,10 +23,10 @@ inline constexpr std::array<const char*, kPhaseCount> kPhaseNames{
     "detection", "assembly", "analysis", "factorization", "solve", "line_search", "other"};
 using Seconds = std::array<double, kPhaseCount>;
 
-/// Tells the time of one thread by phase: at any moment exactly one phase runs.
+/// Measures the time of one thread by phase: exactly one phase is active at any moment.
 class Stopwatch {
  public:
-  /// Time from here on counts for the phase; returns the one that ran.
+  /// Start a phase; returns the phase that was active.
   Phase enter(Phase phase) {
     const Clock::time_point now = Clock::now();
     seconds_[static_cast<std::size_t>(phase_)] +=
@@ -36,13 +35,13 @@ class Stopwatch {
     return std::exchange(phase_, phase);
   }
 
-  /// All seconds up to now.
+  /// Seconds of all phases up to now.
   const Seconds& read() {
     enter(phase_);
     return seconds_;
   }
 
-  /// While it lives a phase runs; then the one before goes on.
+  /// Scope of a phase; afterwards the previous phase continues.
   class Scope {
    public:
     Scope(Stopwatch& watch, Phase phase) : watch_(watch), before_(watch.enter(phase)) {}

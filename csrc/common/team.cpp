@@ -13,7 +13,7 @@ Team::~Team() {
     ends_ = true;
   }
   changed_.notify_all();
-  helpers_.clear();  // joined before anything that they use is gone
+  helpers_.clear();  // joined before the members they use are destroyed
 }
 
 void Team::run(Index count, const Ready& ready, const Body& body) {
@@ -54,7 +54,7 @@ void Team::help(int member) {
   }
 }
 
-/// Take part in a loop until all of it is done.
+/// Participate in a loop until it is complete.
 void Team::work(std::unique_lock<std::mutex>& lock, int member) {
   while (left_ > 0) {
     const Index i = find_ready();
@@ -75,7 +75,7 @@ void Team::work(std::unique_lock<std::mutex>& lock, int member) {
   }
 }
 
-/// The lowest index that may begin, or -1.
+/// Lowest index that may begin, or -1.
 Index Team::find_ready() {
   if (left_ == 0) return -1;
   const auto count = static_cast<Index>(taken_.size());

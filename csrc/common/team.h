@@ -13,9 +13,8 @@ namespace diffcloth {
 
 /// Threads that share the work on one environment: the caller's, and helpers.
 ///
-/// Helpers begin with the first loop that has work for them, sleep between loops, and end with the
-/// team. Where the system refuses to make as many, fewer do the work. One thread at a time calls
-/// run().
+/// Helpers start with the first loop that has work for them, sleep between loops, and end with the team.
+/// If the system provides fewer threads, fewer do the work. Only one thread at a time may call run().
 class Team {
  public:
   explicit Team(int size) : size_(std::max(size, 1)) {}
@@ -23,23 +22,23 @@ class Team {
   Team(const Team&) = delete;
   Team& operator=(const Team&) = delete;
 
-  /// Most threads of a loop, the caller's included.
+  /// Maximum number of threads of a loop, including the caller's.
   int size() const { return size_; }
 
   /// Processor time that the helpers have spent on all loops so far [s].
   double helpers_seconds() const { return helpers_seconds_; }
 
-  /// What is done of a loop, by index.
+  /// Completed works of a loop, by index.
   using Done = std::vector<char>;
 
-  /// Whether work i may begin; true once all indices below i are done.
+  /// True if work i may begin; must be true once all works below i are done.
   using Ready = std::function<bool(Index i, const Done& done)>;
 
-  /// Does work i as a member in [0, size), and must not throw.
+  /// Executes work i as a member in [0, size); must not throw.
   using Body = std::function<void(Index i, int member)>;
 
-  /// Run body(i, member) for i in [0, count), always the lowest i that may begin. Works of which
-  /// neither has to wait for the other must not share what they write.
+  /// Run body(i, member) for i in [0, count), always the lowest i that is ready. Works without a
+  /// dependency between them must write to different memory.
   void run(Index count, const Ready& ready, const Body& body);
 
  private:
@@ -58,8 +57,8 @@ class Team {
   const Body* body_ = nullptr;
   Done taken_;
   Done done_;
-  Index first_ = 0;  // all below are taken
-  Index left_ = 0;   // not yet done
+  Index first_ = 0;  // all indices below are taken
+  Index left_ = 0;   // number of works not yet done
   bool ends_ = false;
   double helpers_seconds_ = 0.0;
 };

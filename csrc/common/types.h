@@ -18,7 +18,7 @@ using Mat3 = Eigen::Matrix3d;
 using Vec12 = Eigen::Matrix<double, 12, 1>;
 using Mat12 = Eigen::Matrix<double, 12, 12>;
 
-/// Positions, forces, ... of n vertices, one a row; the layout of the arrays that Python owns.
+/// Positions, forces, ... of n vertices, one a row; memory layout of the arrays that Python owns.
 using Rows3 = Eigen::Matrix<double, Eigen::Dynamic, 3, Eigen::RowMajor>;
 using ConstRows3 = Eigen::Map<const Rows3>;
 

@@ -8,8 +8,8 @@ namespace diffcloth::contact {
 ///   b = -(d_hat / s^2) (sigma - s)^2 ln(sigma / s)   for 0 < sigma < s,
 ///   b = 0 for sigma >= s,   b = +infinity for sigma <= 0.
 ///
-/// b is a length: times a stiffness [Pa] and an area it is an energy. b1 and b2 are derivatives by
-/// D; those by d_hat and xi hold D fixed and include the dependence of sigma and s.
+/// b is a length: its product with a stiffness [Pa] and an area is an energy. b1 and b2 are derivatives
+/// by D; derivatives by d_hat and xi hold D fixed and include the dependence of sigma and s.
 struct Barrier {
   double b;
   double b1;
@@ -22,7 +22,7 @@ struct Barrier {
 
 double barrier(double D, double xi, double d_hat);
 
-/// Value and derivatives. For sigma <= 0 only b is defined; the rest is NaN.
+/// Value and derivatives. For sigma <= 0 only b is defined; the derivatives are NaN.
 Barrier barrier_derivatives(double D, double xi, double d_hat);
 
 }  // namespace diffcloth::contact

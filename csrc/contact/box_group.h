@@ -6,13 +6,13 @@
 
 namespace diffcloth::contact {
 
-// Plain arrays: those of the standard library are templates, see linalg/dense_kernels_impl.h.
+// Plain arrays: std::array is a template, see linalg/dense_kernels_impl.h.
 // NOLINTBEGIN(modernize-avoid-c-arrays)
 
-/// Boxes that are compared outright with those of another group.
+/// Number of boxes in a group; two groups are compared box by box, without a hierarchy.
 inline constexpr int kBoxGroup = 4;
 
-/// Axis-aligned boxes side by side; what holds none is the empty box, from +infinity to -infinity.
+/// Axis-aligned boxes side by side. An unused slot holds the empty box, from +infinity to -infinity.
 struct BoxGroup {
   alignas(32) double lo[3][kBoxGroup];
   alignas(32) double hi[3][kBoxGroup];
@@ -20,15 +20,17 @@ struct BoxGroup {
 
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// Which boxes p and q of two groups are near each other: bit kBoxGroup p + q. Near are boxes, each with
-/// a margin of its own around it, that are within the sum of the margins, `range`, as the crow flies
-/// without them; those that overlap only where their margins have corners are not, NaN is. The outcome
-/// of each comparison is as good as random, so that there are no branches.
+/// Pairs of nearby boxes of two groups: bit kBoxGroup p + q is set if box p of `a` and box q of `b` are
+/// near.
+/// Each box includes its own margin; `range` is the sum of the two margins. Two boxes are near if they
+/// overlap and the Euclidean distance of the boxes without margins is at most `range`; overlap of the
+/// corners of two margins does not suffice. A distance of NaN counts as near. The kernel has no
+/// branches, because the outcome of each comparison is unpredictable.
 using NearBoxes = std::uint32_t (*)(const BoxGroup& a, const BoxGroup& b, double range);
 
-/// The same on every level.
+/// Kernel for a level. All levels return identical bits.
 ///
-/// @throws std::invalid_argument  where this processor or build has none of that level
+/// @throws std::invalid_argument  if this processor or build does not support the level
 NearBoxes near_boxes(linalg::KernelLevel level);
 
 }  // namespace diffcloth::contact

@@ -13,7 +13,7 @@ using Mask = long long __attribute__((vector_size(8 * kPack)));
 using Stored = double __attribute__((vector_size(8 * kPack), aligned(8), may_alias));
 
 std::uint32_t find_near_boxes(const BoxGroup& a, const BoxGroup& b, double range) {
-  Mask found = {};  // the bits of each lane; none is in two
+  Mask found = {};  // the bits of each lane; no bit is set in two lanes
   for (int first = 0; first < kBoxGroup; first += kPack) {
     Mask bit;
     for (int l = 0; l < kPack; ++l) bit[l] = 1LL << (first + l);

@@ -11,7 +11,7 @@ namespace {
 
 constexpr Index kLeafSize = kBoxGroup;
 
-/// Smallest box around a group; NaN does not count.
+/// Smallest box around a group; NaN is ignored.
 Box around(const BoxGroup& group) {
   Box box = kEmptyBox;
   for (int axis = 0; axis < 3; ++axis) {
@@ -40,7 +40,7 @@ BoxTree::BoxTree(std::vector<Index> ids, std::span<const Vec3> centers) {
     int axis = 0;
     extent.sizes().maxCoeff(&axis);
 
-    // Half of the leaves on either side, so that leaves are full.
+    // Half of the leaves on either side of the split, so that leaves are full.
     const Index leaf_count = (last - first + kLeafSize - 1) / kLeafSize;
     const Index middle = first + (leaf_count + 1) / 2 * kLeafSize;
     std::nth_element(order.begin() + first, order.begin() + middle, order.begin() + last,

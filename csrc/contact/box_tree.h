@@ -24,8 +24,8 @@ inline constexpr Box kEmptyBox{
     .hi = {-std::numeric_limits<double>::infinity(), -std::numeric_limits<double>::infinity(),
            -std::numeric_limits<double>::infinity()}};
 
-/// Whether two closed boxes have a point in common; in full, because the outcome of each comparison
-/// is as good as random.
+/// True if two closed boxes have a point in common. All six comparisons are evaluated without branches,
+/// because the outcome of each is unpredictable.
 inline bool overlap(const Box& a, const Box& b) {
   return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) & (b.lo[1] <= a.hi[1]) &
          (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
@@ -41,12 +41,13 @@ inline Box united(const Box& a, const Box& b) {
   return box;
 }
 
-/// Binary tree over boxes whose shape is fixed once: only the boxes are refitted afterwards, so
-/// that what a search visits, and in which order, does not depend on earlier searches.
+/// Binary tree over boxes whose shape is fixed at construction; afterwards only the boxes are refitted.
+/// The nodes that a search visits, and their order, therefore do not depend on earlier searches.
 class BoxTree {
  public:
-  /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0), and its
-  /// items are one group. Its children are the nodes left and left + 1, behind the node itself.
+  /// A node holds the items first .. last - 1 of items(). A leaf has no children (left = 0), and its
+  /// items are one group. The children of an inner node are the nodes left and left + 1, which follow
+  /// the node in nodes().
   struct Node {
     Index first;
     Index last;
@@ -72,7 +73,7 @@ class BoxTree {
     return std::span(items_).subspan(node.first, node.last - node.first);
   }
 
-  /// Compute the boxes of all items and nodes from those of the items.
+  /// Compute the boxes of all items by `box_of`, and the boxes of all nodes from them.
   template <class BoxOf>
   void fit(Boxes& boxes, BoxOf&& box_of) const {
     boxes.items.resize((items_.size() + kBoxGroup - 1) / kBoxGroup);
@@ -94,11 +95,11 @@ class BoxTree {
   std::vector<Node> nodes_;
 };
 
-/// Visit the pairs of leaves of two trees, or of one with itself each once, that may hold what is looked
-/// for. Which do is as good as random: every pair is written on the stack, and kept by counting on, which
-/// spares the processor the guess.
+/// Visit the candidate pairs of leaves of two trees, or of one tree with itself (each pair once). The
+/// outcome of `near` is unpredictable: every pair is written to the stack, and the stack grows by the
+/// outcome, which avoids branch mispredictions.
 ///
-/// @param near  of two nodes, by their numbers: whether anything in them may be what is looked for
+/// @param near  predicate on two node numbers: false only if no pair of items in the nodes is wanted
 template <class Stack, class Near, class Visit>
 void visit_leaf_pairs(
     const BoxTree& tree_a, const BoxTree& tree_b, Stack& stack, Near&& near, Visit&& visit) {

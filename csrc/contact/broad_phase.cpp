@@ -19,7 +19,7 @@ using PairList = BroadPhase::Scratch::PairList;
 /// and of positions interpolated between the ends of the motion.
 constexpr double kOutward = 1e-15;
 
-/// Rounding of a distance across middles, relative to the coordinates, rounded up.
+/// Rounding error of the distance lower bound in are_apart(), relative to the coordinates, rounded up.
 constexpr double kAcross = 1e-14;
 
 NearBoxes near_boxes_here() {
@@ -27,8 +27,8 @@ NearBoxes near_boxes_here() {
   return best;
 }
 
-/// Append the pairs of items of two leaves that are near each other. Which are is as good as random: every
-/// pair is written, and kept by counting on, which spares the processor the guess.
+/// Append the pairs of nearby items of two leaves. Their number is unpredictable: every pair is written,
+/// and the end advances by its bit, which avoids branch mispredictions.
 void append_pairs(const BoxTree& tree_a,
                   Index first_a,
                   const BoxTree& tree_b,
@@ -37,7 +37,7 @@ void append_pairs(const BoxTree& tree_a,
                   PairList& pairs) {
   if (near == 0) return;
   IndexPair* end = pairs.room(kBoxGroup * kBoxGroup);
-  // What a leaf does not hold is near nothing; it is not read either.
+  // Unused slots of a leaf are near nothing; their items must not be read.
   const Index size_a = std::min<Index>(kBoxGroup, tree_a.items().size() - first_a);
   const Index size_b = std::min<Index>(kBoxGroup, tree_b.items().size() - first_b);
   const Index* const a = tree_a.items().data() + first_a;
@@ -51,8 +51,8 @@ void append_pairs(const BoxTree& tree_a,
   pairs.end_at(end);
 }
 
-/// Append all (item of a, item of b) whose boxes are within range. Of nodes only the boxes with their
-/// margins are compared, which costs half as much and lets few more pass.
+/// Append all (item of a, item of b) whose boxes are within range. Nodes are compared by overlap of
+/// their boxes with margins alone, which costs half as much and accepts few more pairs.
 void append_overlaps(const BoxTree& tree_a,
                      const BoxTree::Boxes& a,
                      const BoxTree& tree_b,
@@ -88,8 +88,8 @@ void append_self_overlaps(const BoxTree& tree,
       });
 }
 
-/// Whether two primitives are certainly farther apart than `range`: across their middles, that is along the
-/// sum of the vectors between their corners.
+/// True if two primitives are certainly farther apart than `range`: lower bound of the distance along
+/// the sum of the vectors between their corners.
 template <std::size_t kCount>
 bool are_apart(const std::array<Vec3, kCount>& between, double range) {
   Vec3 n = between[0];
@@ -123,7 +123,7 @@ void sort_pairs(PairList& pairs, BroadPhase::Scratch& scratch) {
   for (const IndexPair& pair : pairs) scratch.sorted[bucket[pair[0]]++] = pair;
   Index first = 0;
   for (Index a = 0; a < count; ++a) {
-    const Index last = bucket[a];  // moved on to the end of its run by the loop above
+    const Index last = bucket[a];  // advanced to the end of its run by the loop above
     std::sort(scratch.sorted.begin() + first, scratch.sorted.begin() + last);
     first = last;
   }
@@ -134,7 +134,7 @@ Box point_box(const double* x, Index v) {
   return {.lo = p, .hi = p};
 }
 
-/// Box of a motion as seen from a frame that moves by `frame` meanwhile.
+/// Box of a motion in a frame that translates by `frame` during the motion.
 Box swept(const Box& t0, const Box& t1, const Vec3& frame, double reach) {
   Box box;
   for (int k = 0; k < 3; ++k) {
@@ -149,7 +149,7 @@ Box swept(const Box& t0, const Box& t1, const Vec3& frame, double reach) {
   return box;
 }
 
-/// Of all surfaces, where a search starts.
+/// Largest absolute coordinate of all surfaces at the start of a search.
 double largest_coordinate(const BroadPhase::Scratch& scratch) {
   double largest = 0.0;
   for (const BroadPhase::Scratch::Surface& surface : scratch.surfaces) {
@@ -179,7 +179,7 @@ BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x_reference) : m
     }
     return BoxTree(std::move(ids), centers);
   };
-  // Vertices without a face bound nothing: they belong to no surface here.
+  // Vertices without a face bound nothing: no tree contains them.
   std::vector<Index> used_surface(mesh_.vertex_count, -1);
   std::vector<std::array<Index, 1>> vertices(mesh_.vertex_count);
   for (Index v = 0; v < mesh_.vertex_count; ++v) vertices[v] = {v};
@@ -209,8 +209,8 @@ void BroadPhase::measure_motion(const Sweep& sweep, Scratch& scratch) const {
     }
     const auto count = static_cast<double>(trees_[s].vertices.items().size());
     const Vec3 mean = count > 0 ? Vec3(sum / count) : Vec3::Zero();
-    // Within the reach a frame saves little, and costs the boxes of one more frame. Written so that
-    // a motion that is not finite has none.
+    // A mean motion within the reach saves little in a moving frame, but requires refitted boxes. A
+    // motion that is not finite gets no frame.
     surface.motion =
         mean.allFinite() && mean.cwiseAbs().maxCoeff() > sweep.reach[s] ? mean : Vec3::Zero();
   }
@@ -259,7 +259,7 @@ void BroadPhase::visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit
   }
 }
 
-/// Pairs of indices whose boxes are near each other, in no order, without those that share a vertex.
+/// Unordered index pairs whose boxes are near each other, without pairs that share a vertex.
 void BroadPhase::collect_pairs(const Sweep& sweep, Scratch& scratch) const {
   PairList& vertex_faces = scratch.vertex_face_pairs;
   PairList& edges = scratch.edge_pairs;
@@ -290,7 +290,7 @@ void BroadPhase::collect_pairs(const Sweep& sweep, Scratch& scratch) const {
          [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
 }
 
-/// Drop the collected pairs that are certainly beyond their reaches at x, the start of the sweep.
+/// Remove the collected pairs that are certainly beyond their reaches at x, the start of the sweep.
 void BroadPhase::drop_distant(const double* x,
                               std::span<const double> reach,
                               Scratch& scratch) const {
@@ -313,7 +313,7 @@ void BroadPhase::drop_distant(const double* x,
   });
 }
 
-/// The collected pairs as candidates, in order.
+/// Write the collected pairs as sorted candidates.
 void BroadPhase::write_pairs(Scratch& scratch, std::vector<Candidate>& out) const {
   out.clear();
   sort_pairs(scratch.vertex_face_pairs, scratch);
@@ -345,12 +345,12 @@ void BroadPhase::find_at_rest(const double* x,
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,
                                                                      Scratch& scratch) const {
   const std::vector<double> reach(trees_.size(), 0.0);
-  PairList pairs;  // of an edge and a face: many, and not wanted at every step
+  PairList pairs;  // (edge, face); many, and not needed at every step
   const Sweep sweep{.x_t0 = x, .x_t1 = x, .reach = reach, .of_vertices = false};
   visit_surface_pairs(sweep, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    // Nothing pierces a skeleton.
+    // Skeletons have no interior that an edge could pierce.
     if (!mesh_.is_round(r)) {
       append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, 0.0, scratch.stack,
                       pairs);

@@ -54,15 +54,15 @@ inline Candidate candidate_of_edges(const CollisionMesh& mesh, Index e, Index f)
   return {.kind = PairKind::kEdgeEdge, .vertices = {i, j, k, l}, .a = e, .b = f};
 }
 
-/// Which pairs can come close at all, by swept boxes.
+/// Broad phase: finds the pairs that can come close at all, by swept boxes.
 ///
-/// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
-/// are: vertex and face, edge and edge, of surfaces that may touch. Pairs that share a vertex are
-/// left out, as are vertices that belong to no face, and the faces of round bodies where vertices of
-/// meshes meet them: the skeleton's own vertices and edge meet all faces and edges of the mesh.
+/// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs are
+/// vertex-face and edge-edge pairs of surfaces that may touch. Excluded are pairs that share a vertex,
+/// vertices that belong to no face, and pairs of a mesh vertex and the face of a round body: there the
+/// vertices and the edge of the skeleton are paired with all faces and edges of the mesh.
 class BroadPhase {
  public:
-  /// @param mesh         outlives this
+  /// @param mesh         must outlive this object
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
   BroadPhase(const CollisionMesh& mesh, const double* x_reference);
 
@@ -76,7 +76,7 @@ class BroadPhase {
 
   const SurfaceTrees& trees(Index surface) const { return trees_[surface]; }
 
-  /// Whether vertices of one surface meet the faces of another.
+  /// True if vertices of one surface are paired with faces of another.
   bool meet(Index of_vertices, Index of_faces) const {
     return mesh_.is_round(of_vertices) || !mesh_.is_round(of_faces);
   }
@@ -89,9 +89,9 @@ class BroadPhase {
       BoxTree::Boxes faces;
       Box box_t0;   ///< Around the whole surface at the start, without margin.
       Box box_t1;   ///< Likewise at the end.
-      Vec3 motion;  ///< Mean motion of its vertices; zero where it is not worth a frame.
+      Vec3 motion;  ///< Mean motion of its vertices; zero if too small to merit its own frame.
       Vec3 frame;   ///< Motion of the frame that the trees' boxes are in.
-      bool fitted;  ///< Whether the trees' boxes belong to the present search.
+      bool fitted;  ///< True if the trees' boxes belong to the current search.
     };
     /// Growing list that is written through a pointer.
     class PairList {
@@ -126,13 +126,13 @@ class BroadPhase {
     PairList stack;
   };
 
-  /// All pairs whose boxes, each swept from x_t0 to x_t1 and rounded outward, are within the sum of
-  /// the two surfaces' reaches of each other. Boxes are swept in a frame that moves as a surface does on
-  /// average: the second of a pair if it is a body, else the first. A cloth that flies as a whole
-  /// thus meets itself as if it were at rest.
+  /// All pairs whose boxes, each swept from x_t0 to x_t1 and rounded outward, are within the sum of the
+  /// two surfaces' reaches of each other. Boxes are swept in a frame that moves with the mean motion of
+  /// a surface: the second of a pair if it is a body, else the first. A flying cloth is therefore
+  /// searched against itself as if it were at rest.
   ///
-  /// Sorted; every pair that comes within the sum of the two reaches at any time of the straight
-  /// motion is among them.
+  /// Sorted. Includes every pair that comes within the sum of the two reaches at any time of the
+  /// straight motion.
   ///
   /// @param reach  [surfaces] [m]
   void find(const double* x_t0,
@@ -141,8 +141,8 @@ class BroadPhase {
             Scratch& scratch,
             std::vector<Candidate>& out) const;
 
-  /// Of the pairs that find() finds where nothing moves, those within the sum of the two surfaces' reaches
-  /// of each other, and few more: many are near by their boxes alone.
+  /// Pairs within the sum of the two surfaces' reaches at x, and a few more: the result of find()
+  /// without motion, minus most pairs that are near by their boxes alone.
   void find_at_rest(const double* x,
                     std::span<const double> reach,
                     Scratch& scratch,
@@ -155,12 +155,12 @@ class BroadPhase {
   std::optional<std::pair<Index, Index>> find_intersection(const double* x, Scratch& scratch) const;
 
  private:
-  /// What a search is about.
+  /// Input of one search.
   struct Sweep {
     const double* x_t0;
     const double* x_t1;
     std::span<const double> reach;
-    bool of_vertices = true;  ///< whether pairs of a vertex are looked for
+    bool of_vertices = true;  ///< if true, pairs of a vertex and a face are searched, too
   };
 
   void measure_motion(const Sweep& sweep, Scratch& scratch) const;
@@ -169,8 +169,8 @@ class BroadPhase {
   void drop_distant(const double* x, std::span<const double> reach, Scratch& scratch) const;
   void write_pairs(Scratch& scratch, std::vector<Candidate>& out) const;
 
-  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the lower first (a surface
-  /// with itself included); their trees are fitted by then.
+  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the lower index first
+  /// (including each surface with itself). The trees of both surfaces are fitted before the visit.
   template <class Visit>
   void visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const;
 

@@ -11,30 +11,32 @@
 namespace diffcloth::contact {
 namespace {
 
-/// A skin is this many times the motion at hand, but within these shares of the smallest reach: a thin
-/// one is soon used up, a thick one holds pairs that never meet.
+/// The skin is this multiple of the current motion, clamped to these fractions of the smallest reach: a
+/// thin skin is soon used up, a thick one holds pairs that never meet.
 constexpr double kAhead = 2.0;
 constexpr double kThinnest = 0.5;
 constexpr double kThickest = 4.0;
-/// That of a near list is at most this share of it.
+/// A near list is built if half of the approach of the motion is at most this fraction of the smallest
+/// reach.
 constexpr double kNear = 1.0;
-/// A list is worn when the searches beside it have looked at one pair of leaves for so many of its pairs,
-/// which costs about as much as another one. Surfaces move on from where a step starts to where it ends: from a
-/// list that is made there, short motions are answered without a search.
+/// The wide list is rebuilt when the searches beside it have visited one pair of leaves for every kWorn
+/// pairs of the list, which costs about as much as a new list. Surfaces move from the start of a step to
+/// its end: a list that is built near the end serves short motions without a search.
 constexpr std::size_t kWorn = 4;
-/// Rounding of a distance, relative to the coordinates.
+/// Rounding error of a distance, relative to the coordinates.
 constexpr double kRounding = 1e-14;
-/// Boxes are asked for this much more than distances are, which round otherwise.
+/// The skin for boxes exceeds the margin for distances by this factor, because the two round
+/// differently.
 constexpr double kMore = 1.01;
 
-/// What the vertices of a surface have done since the reference.
+/// Displacements of the vertices of a surface since the reference.
 struct Travel {
   Vec3 mean = Vec3::Zero();
-  double around_mean = 0.0;  ///< largest deviation from it
+  double around_mean = 0.0;  ///< largest deviation from the mean
   double largest = 0.0;
 };
 
-/// Sort in what has been appended behind `middle` sorted pairs, each once.
+/// Merge the unsorted pairs behind `middle` sorted pairs into order, each once.
 void sort_in(std::size_t middle, Found& found) {
   std::vector<std::size_t> order(found.pairs.size() - middle);
   if (order.empty()) return;
@@ -56,12 +58,12 @@ void sort_in(std::size_t middle, Found& found) {
   std::swap(found, all);
 }
 
-/// NaN counts as the largest of all.
+/// Maximum in which NaN counts as the largest value.
 void raise(double& largest, double value) {
   if (!(value <= largest) && !std::isnan(largest)) largest = value;
 }
 
-/// Of each surface, whose vertices come one after another.
+/// Travel of each surface. Vertices are grouped by surface.
 std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const double* to) {
   std::vector<Travel> result(mesh.surface_count());
   for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
@@ -76,7 +78,7 @@ std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const
       raise(motion.largest, u.squaredNorm());
       raise(motion.around_mean, (u - motion.mean).squaredNorm());
     }
-    motion.largest = std::sqrt(motion.largest);  // one root for all, which keeps their order
+    motion.largest = std::sqrt(motion.largest);  // one root for the maximum: roots keep the order
     motion.around_mean = std::sqrt(motion.around_mean);
     result[surface] = motion;
   }
@@ -85,8 +87,8 @@ std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const
 
 }  // namespace
 
-/// How much two surfaces can have come closer since a reference, at most, into approach_; 0 of those
-/// that never touch. Returns the largest.
+/// Upper bound of the approach of every two surfaces since a reference, into approach_; 0 for surfaces
+/// that may not touch. Returns the largest bound.
 double CandidateList::measure_approach(const double* reference,
                                        const double* x_t0,
                                        const double* x_t1) {
@@ -94,7 +96,7 @@ double CandidateList::measure_approach(const double* reference,
   const auto count = static_cast<std::size_t>(mesh.surface_count());
   approach_.assign(count * count, 0.0);
   double result = 0.0;
-  // Along a straight motion displacements are largest at one of its ends.
+  // Displacements of a straight motion are largest at one of its ends.
   for (const auto& [x, mean] : {std::pair(x_t0, &mean_t0_), std::pair(x_t1, &mean_t1_)}) {
     const std::vector<Travel> moved = motions(mesh, reference, x);
     mean->clear();
@@ -113,7 +115,7 @@ double CandidateList::measure_approach(const double* reference,
   return result;
 }
 
-/// Make the wide list at the start of a motion.
+/// Build the wide list at the start of a motion.
 void CandidateList::build(const double* x_t0,
                           const double* x_t1,
                           std::span<const double> reach,
@@ -127,7 +129,7 @@ void CandidateList::build(const double* x_t0,
   rounding_ = kRounding * largest;
   const double approach = measure_approach(wide_.reference.data(), x_t0, x_t1);
   const double smallest = reach.empty() ? 0.0 : std::ranges::min(reach);
-  // Also where the motion is not finite.
+  // std::min and std::max in this order also handle a motion that is not finite.
   wide_.skin =
       std::max(kThinnest * smallest, std::min(kThickest * smallest, kAhead * 0.5 * approach));
   has_parts_ = false;
@@ -139,9 +141,9 @@ void CandidateList::build(const double* x_t0,
   keep_near_ones(wide_);
 }
 
-/// Make the near list at the start of a motion with this approach.
+/// Build the near list at the start of a motion with this approach.
 void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::Scratch& scratch) {
-  near_.reference.clear();  // no list stands anywhere if an exception ends the search
+  near_.reference.clear();  // no valid list remains if an exception ends the search
   near_.skin = std::clamp(kAhead * 0.5 * approach,
                           reach_.empty() ? 0.0 : kThinnest * std::ranges::min(reach_), wide_.skin);
   with_skin_.clear();
@@ -152,8 +154,8 @@ void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::
   keep_near_ones(near_);
 }
 
-/// Measure the distances of a list, and drop what is beyond its skins: boxes are near sooner than what
-/// is in them.
+/// Compute the distances of a list, and drop pairs beyond its skins: boxes may be near although the
+/// primitives are not.
 void CandidateList::keep_near_ones(Kept& kept) const {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const double* const x = kept.reference.data();
@@ -172,11 +174,12 @@ void CandidateList::keep_near_ones(Kept& kept) const {
   }
   kept.distance.resize(count);
   kept.pairs.resize(count);
-  kept.pairs.shrink_to_fit();  // often to next to nothing
+  kept.pairs.shrink_to_fit();  // often to almost nothing
   kept.middle = first_of_edges(kept.pairs);
 }
 
-/// How much vertices have moved against the means of their surfaces, and these against each other.
+/// Deviations of the vertices from the mean displacements of their surfaces, and differences of these
+/// means.
 void CandidateList::measure_deviations() {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const auto count = static_cast<std::size_t>(mesh.surface_count());
@@ -195,7 +198,7 @@ void CandidateList::measure_deviations() {
   }
 }
 
-/// Of what is kept, what may come within reach, by what measure_approach() has found for it.
+/// Select the stored pairs that may come within reach, by the bounds of measure_approach().
 void CandidateList::cull(const Kept& kept,
                          const double* x_t0,
                          const double* x_t1,
@@ -208,15 +211,15 @@ void CandidateList::cull(const Kept& kept,
     u_t0_[a] = x_t0[a] - kept.reference[a];
     u_t1_[a] = x_t1[a] - kept.reference[a];
   }
-  std::vector<double> together;  // of each pair of surfaces
+  std::vector<double> together;  // for each pair of surfaces
   for (const double a : reach) {
     for (const double b : reach) together.push_back(a + b + 2.0 * rounding_);
   }
   measure_deviations();
   const auto spare = [&](Index k) { return kept.distance[k] - together[kept.surfaces[k]]; };
-  // A surface counts as near as its fastest part; few of its pairs are: by bounds on how their corners move
-  // before those corners are compared. Which pairs are is as good as random: all are written, and kept by
-  // counting on.
+  // approach_ bounds a surface by its fastest part, and few pairs are that fast: per-vertex bounds
+  // discard most of them before the corners of each pair are compared. The outcome is unpredictable:
+  // every index is written, and the count advances by the outcome, without a branch.
   maybe_.resize(kept.pairs.size());
   Index count = 0;
   for (Index k = 0; k < static_cast<Index>(kept.pairs.size()); ++k) {
@@ -245,9 +248,9 @@ void CandidateList::cull(const Kept& kept,
   out.resize(found);
 }
 
-/// What may come within reach, from the wide list and beside it.
+/// Find all pairs that may come within reach, in the wide list and beside it.
 ///
-/// @param widened  how much more each reach is than what the list was made for [m]
+/// @param widened  excess of each reach over the reach of the list [m]
 void CandidateList::find_wide(const double* x_t0,
                               const double* x_t1,
                               std::span<const double> reach,
@@ -264,7 +267,7 @@ void CandidateList::find_wide(const double* x_t0,
   looked_at_ += relative_search_.find({.reference = wide_.reference.data(),
                                        .x_t0 = x_t0,
                                        .x_t1 = x_t1,
-                                       .u_t0 = u_t0_.data(),  // of cull()
+                                       .u_t0 = u_t0_.data(),  // computed by cull()
                                        .u_t1 = u_t1_.data(),
                                        .reach = reach,
                                        .least = std::max(least, 0.0),
@@ -281,7 +284,7 @@ void CandidateList::find_at(const double* x,
                             std::vector<Candidate>& out) {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const Index count = mesh.surface_count();
-  // How near the pairs of two surfaces must be; negative where none is wanted.
+  // Largest distance of the pairs of two surfaces; negative if the pair of surfaces is not wanted.
   std::vector<double> range;
   for (Index s = 0; s < count; ++s) {
     for (Index r = 0; r < count; ++r) {

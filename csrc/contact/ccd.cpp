@@ -11,21 +11,22 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Share of the initial gap, and of the barrier distance if that is less, that a motion leaves.
+/// Fraction of the initial gap, or of the barrier distance if smaller, that remains at the end of a safe
+/// step.
 constexpr double kGapLeft = 0.1;
 
-/// A search ends where it goes on by less than this share of the time.
+/// The iteration stops if it advances by less than this relative step in time.
 constexpr double kSettled = 1e-12;
 
-/// Rounding of positions, relative to the largest coordinate, that counts as contact.
+/// Rounding error of positions, relative to the largest coordinate; smaller gaps count as contact.
 constexpr double kPositionRounding = 1e-12;
 
-/// A search that has not ended by then returns the safe time it has reached.
+/// Iteration limit; the safe time reached by then is returned.
 constexpr int kMaxIterations = 1000;
 
 using Differences = std::array<Vec3, 4>;
 
-/// Vectors from the corners of the second primitive to those of the first: four for two edges,
+/// Vectors from the corners of the second primitive to the corners of the first: four for two edges,
 /// three for a point and a triangle (the fourth repeats the third).
 Differences between(PairKind kind, const Corners& x) {
   switch (kind) {
@@ -37,7 +38,8 @@ Differences between(PairKind kind, const Corners& x) {
   __builtin_unreachable();
 }
 
-/// Whether the boxes around the two motions are farther apart than `gap` along an axis. They are finite.
+/// True if the boxes around the two motions are farther apart than `gap` along an axis. Coordinates must
+/// be finite.
 bool stay_apart(PairKind kind, const Corners& x_t0, const Corners& x_t1, double gap) {
   std::array<Vec3, 4> lo;
   std::array<Vec3, 4> hi;
@@ -55,7 +57,7 @@ bool stay_apart(PairKind kind, const Corners& x_t0, const Corners& x_t1, double 
 }
 
 /// Latest time up to which n . (start + time motion) >= bound holds from t on, for all differences;
-/// -infinity where it does not hold at t.
+/// -infinity if the inequality does not hold at t.
 double certified_time(
     const Vec3& n, const Differences& start, const Differences& motion, double t, double bound) {
   double time = std::numeric_limits<double>::infinity();
@@ -74,7 +76,7 @@ double certified_time(
 }  // namespace
 
 double harmless_distance(double xi, double d_hat, double largest) {
-  // A search goes on by more than kSettled then, whatever it is that rounds.
+  // With this margin each iteration advances by more than kSettled, whatever the rounding.
   constexpr double kClearly = 10.0;
   return xi + kGapLeft * d_hat + kClearly * kPositionRounding * largest;
 }

@@ -4,15 +4,16 @@
 
 namespace diffcloth::contact {
 
-/// Fraction in [0, limit] of the straight motion x_t0 -> x_t1 over which a pair stays farther apart
-/// than xi: the limit only if that much is certified, 0 if the pair is in contact at x_t0.
+/// Fraction in [0, limit] of the straight motion x_t0 -> x_t1 over which a pair stays farther apart than
+/// xi: the limit only if the motion is certified up to it, 0 if the pair is in contact at x_t0.
 ///
-/// It is the time at which the gap d - xi first falls to g = 0.1 min(d(0) - xi, d_hat), to rounding. So it
-/// does not jump where the motion changes a little, which a share of the gap at which a search happens
-/// to end would do. Pairs that no barrier sees on the whole motion are never the first.
+/// The result is the time at which the gap d - xi first falls to g = 0.1 min(d(0) - xi, d_hat), to
+/// rounding. It is therefore continuous in the motion, in contrast to the gap at which an iteration
+/// happens to terminate. Pairs that stay outside the barrier's range on the whole motion never determine
+/// the minimum.
 ///
-/// Additive continuous collision detection [Li et al. 2021] with a directional certificate. At the
-/// time reached, with closest vector t, d = |t| and n = t/d, the gap is g or more over the larger of
+/// Additive continuous collision detection (CCD) [Li et al. 2021] with a directional certificate. At the
+/// current time, with closest vector t, d = |t| and n = t/d, the gap is at least g over the larger of
 ///
 ///   (d - xi - g) / l_p    l_p: the largest relative displacement between the primitives,
 ///   the time for which n . (x_i - x_j) >= xi + g for every i of one and j of the other primitive.
@@ -20,7 +21,7 @@ namespace diffcloth::contact {
 /// A distance below xi + 1e-12 |x|_max counts as contact, which covers the rounding of the positions.
 ///
 /// @param d_hat  barrier distance [m]
-/// @param limit  beyond which nobody asks
+/// @param limit  upper bound of the result; later times are not searched
 double safe_step(PairKind kind,
                  const Corners& x_t0,
                  const Corners& x_t1,
@@ -28,9 +29,10 @@ double safe_step(PairKind kind,
                  double d_hat,
                  double limit = 1.0);
 
-/// A pair that stays farther apart than this on all of a motion is not the first: its safe_step() is the limit.
+/// Distance such that a pair that stays farther apart on all of a motion never limits it: its
+/// safe_step() is the limit.
 ///
-/// @param largest  of the coordinates at both ends [m]
+/// @param largest  largest absolute coordinate at both ends [m]
 double harmless_distance(double xi, double d_hat, double largest);
 
 }  // namespace diffcloth::contact

@@ -56,12 +56,12 @@ void check(const CollisionMesh& mesh) {
   }
 }
 
-/// An edge of a face, to be sorted and made unique.
+/// Side of a face; sorted to find the unique edges.
 struct HalfEdge {
   Index surface;
   CollisionMesh::Edge edge;
-  Index face;  ///< -1 of a skeleton, which has none
-  int side;    ///< It joins the corners side and side + 1.
+  Index face;  ///< -1: segment of a skeleton, whose face has no area
+  int side;    ///< The side joins the corners side and side + 1.
 };
 
 std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {

@@ -13,11 +13,11 @@ namespace diffcloth::contact {
 /// A surface is a cloth (0 .. cloth_count - 1) or a body (from cloth_count on). Faces and edges are
 /// grouped by surface in the same order.
 ///
-/// A body may be round: all points within its radius of a skeleton, which is a point (the body is a
-/// sphere) or a segment (a capsule). Contact with it is contact with the skeleton, at a distance that is
-/// larger by the radius. Its only face, {p, p, p} or {p, q, q}, has no area: it stands for the skeleton
-/// where others meet it. Of its vertices the skeleton takes the first, or the first two; the others say how
-/// it turns.
+/// A body may be round: all points within its radius of a skeleton, which is a point (a sphere) or a
+/// segment (a capsule). Contact with it is contact with the skeleton, at a distance that is larger by
+/// the radius. Its only face, {p, p, p} or {p, q, q}, has no area: it represents the skeleton in pairs
+/// with other surfaces. The skeleton uses the first vertex of the body, or the first two; the remaining
+/// vertices define its orientation.
 struct CollisionMesh {
   using Face = std::array<Index, 3>;
   using Edge = std::array<Index, 2>;
@@ -32,18 +32,18 @@ struct CollisionMesh {
   std::vector<Index> vertex_surface;
   std::vector<Index> face_surface;
   std::vector<Index> edge_surface;
-  std::vector<std::array<Index, 2>> edge_faces;  ///< -1 where missing; the first two of several.
+  std::vector<std::array<Index, 2>> edge_faces;  ///< -1 if missing; the first two of several.
   std::vector<std::array<Index, 3>> face_edges;  ///< Edge k joins the corners k and k + 1.
-  std::vector<double> radius;                    ///< [surfaces] 0 where not round [m]
+  std::vector<double> radius;                    ///< [surfaces] 0 if not round [m]
   SurfacePairs touching;
 
   CollisionMesh() = default;
 
   /// @param faces           corners of every face, grouped by surface in ascending order
   /// @param vertex_surface  surface of every vertex, ascending
-  /// @param touching        which of the surfaces may touch; it says how many there are
+  /// @param touching        pairs of surfaces that may touch; defines the number of surfaces
   /// @param radius          of each surface; empty: none is round
-  /// @throws std::invalid_argument naming the first face or vertex that breaks this.
+  /// @throws std::invalid_argument  if a face or vertex violates these conditions; names the first
   CollisionMesh(std::vector<Face> faces,
                 std::vector<Index> vertex_surface,
                 Index cloth_count,
@@ -52,7 +52,7 @@ struct CollisionMesh {
 
   Index surface_count() const { return touching.surface_count(); }
   bool is_round(Index surface) const { return radius[surface] > 0.0; }
-  /// Whether a round surface is a sphere.
+  /// True if a round surface is a sphere.
   bool is_point(Index surface) const { return is_point_[surface] != 0; }
   bool is_round_vertex(Index v) const { return is_round(vertex_surface[v]); }
   bool is_round_edge(Index e) const { return is_round(edge_surface[e]); }

@@ -11,21 +11,21 @@
 namespace diffcloth::contact {
 namespace {
 
-/// What is nearer than the sum of its reaches and this share of d_hat may be in contact soon.
+/// Pairs within the sum of their reaches and this fraction of d_hat may be in contact soon.
 constexpr double kSoon = 0.4;
 
-/// A motion that changes the shape of a surface by more than so many times its size is watched in parts.
+/// A motion that distorts a surface by more than this multiple of its size is watched in parts.
 constexpr double kTorn = 1.0;
-/// The first part changes a shape by this share of its size, and each next one by so many times more.
+/// Distortion of the first part, in sizes of the surface, and growth factor of each next part.
 constexpr double kFirstPart = 1.0 / 16.0;
 constexpr double kNextPart = 4.0;
-/// Pairs between two looks at the clock, which cost a tenth of a microsecond each.
+/// Number of pairs between two reads of the clock, which cost a tenth of a microsecond each.
 constexpr int kPairsAtOnce = 64;
 
 using Stencil = std::array<Index, 4>;
 
-/// How much the vertices of a surface move against their mean, at most, in sizes of the surface: the largest
-/// over all surfaces. NaN counts as zero.
+/// Largest deviation of a vertex's displacement from the mean of its surface, in sizes of the surface:
+/// the maximum over all surfaces. NaN counts as zero.
 double distortion(const CollisionMesh& mesh, const double* x, const double* to) {
   double result = 0.0;
   for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
@@ -65,7 +65,8 @@ bool moves(std::span<const Index> v, const Products& products) {
   return std::ranges::any_of(products.z, [&](const double* d) { return moves(v, d); });
 }
 
-/// Multiply Hessians of contacts: call multiply(kernels, z, y) with the rows of directions side by side.
+/// Multiply by Hessians of contacts: calls multiply(kernels, z, y) with the rows of directions side by
+/// side.
 template <class Multiply>
 void multiply_side_by_side(const Products& products, Index vertex_count, Multiply multiply) {
   const std::size_t size = 3 * static_cast<std::size_t>(vertex_count);
@@ -97,7 +98,7 @@ template <class Visit>
 void ContactPotential::visit_approaching(const double* x, const double* to, Visit&& visit) const {
   const double largest = std::max(largest_coordinate(x), largest_coordinate(to));
   const double d_hat = model_.parameters().d_hat;
-  const double most = 2.0 * std::ranges::max(model_.reach()) - d_hat;  // of any xi
+  const double most = 2.0 * std::ranges::max(model_.reach()) - d_hat;  // largest xi
   const double harmless_to_all = harmless_distance(most, d_hat, largest);
   int visited = 0;
   for (std::size_t k = 0; k < found_.pairs.size(); ++k) {
@@ -212,7 +213,7 @@ void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pa
                                 model_.moving_surfaces(), detection_.scratch, near);
   for (const Candidate& pair : near) {
     add_stencil_couplings(pair.vertices, pairs);
-    // Friction between edges of cloths that do not cross turns with a face of one.
+    // For edges of cloths that do not cross, the gap of friction rotates with a face at the second edge.
     if (pair.kind != PairKind::kEdgeEdge || !model_.between_cloths(pair)) continue;
     if (crosses(pair, x)) continue;
     const Index third = model_.frame(pair)[2];

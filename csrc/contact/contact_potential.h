@@ -13,9 +13,10 @@
 
 namespace diffcloth::contact {
 
-/// What one thread searches with: lists that are kept over the solves of a step.
+/// Search state of one thread: lists that are kept over the solves of a step.
 struct Detection {
-  /// @param checkpoint_in  passed now and then in long searches, which it may end by an exception; may be null
+  /// @param checkpoint_in  polled regularly in long searches, which it may end by an exception; may be
+  /// null
   explicit Detection(const BroadPhase& broad_phase_in, const Checkpoint* checkpoint_in = nullptr)
       : broad_phase(broad_phase_in),
         checkpoint(checkpoint_in),
@@ -27,23 +28,23 @@ struct Detection {
   BroadPhase::Scratch scratch;
 };
 
-/// A potential that contact forces are of. The directions of a tangent share what they have in common.
+/// Potential of contact forces. Tangents along several directions share common intermediate values.
 class TouchingPotential : public Potential {
  public:
-  /// add_tangent() along several directions, whose tangents are in the potential, each with the bits that it
-  /// has alone.
+  /// add_tangent() along several directions, whose tangents are stored in the potential. Each result has
+  /// the same bits as if its direction were evaluated alone.
   virtual void add_tangents(const double* x, std::span<double* const> y) const = 0;
 
   void add_tangent(const double* x, double* y) const final { add_tangents(x, {&y, 1}); }
 };
 
-/// The barrier of all contacts as a potential, and the detection of what may come into contact.
+/// The barrier of all contacts as a potential, and their detection.
 ///
-/// It acts on the pairs that the last watch() has found: a motion must be watched before the
-/// potential is asked about any point of it.
+/// The potential acts on the pairs of the last watch(): a motion must be watched before the potential is
+/// evaluated at any of its points.
 class ContactPotential final : public TouchingPotential {
  public:
-  /// @param bar  where accumulate() adds; null where nobody asks for it
+  /// @param bar  destination of accumulate(); null if not needed
   ContactPotential(const ContactModel& model, Detection& detection, ContactModel::Bar* bar)
       : model_(model), detection_(detection), bar_(bar) {}
 
@@ -52,42 +53,42 @@ class ContactPotential final : public TouchingPotential {
     detection_.candidates.find(x, to, model_.reach(), detection_.scratch, found_);
   }
 
-  /// Stand at a point that a motion leads from.
+  /// Set the current point to the start of a motion.
   void stand_at_start(const double* x) {
     watch(x, x);
     stand_at(x);
   }
 
-  /// Stand at a point that no motion leads from: its pairs alone, without a list for later.
+  /// Set the current point without a motion from it: finds its pairs alone, and keeps no list for later.
   void look_at(const double* x) {
     detection_.broad_phase.find_at_rest(x, model_.reach(), detection_.scratch, found_.pairs);
     found_.apart.assign(found_.pairs.size(), 0.0);
     stand_at(x);
   }
 
-  /// Append the couplings of all contacts that there may soon be after a point: of the pairs that are near
+  /// Append the couplings of all contacts that may soon arise after a point: of the pairs that are near
   /// at x, on surfaces that move.
   void add_couplings_near(const double* x, linalg::Couplings& pairs) const;
 
-  /// Stand at a point whose contacts are known; they outlive the stand.
+  /// Set the current contacts; the caller keeps them alive as long as they are current.
   void adopt(const std::vector<Contact>& contacts) {
     found_.clear();
     adopted_ = &contacts;
     here_.x.clear();
   }
 
-  /// Watch the straight motion x -> to as far as it is free of collisions, and perhaps further; returns the
-  /// fraction that is certified so.
+  /// Watch a collision-free part of the straight motion x -> to, and perhaps more; returns the fraction
+  /// that is certified.
   ///
-  /// A motion that tears a surface to pieces takes everything past everything, and is blocked long before: of
-  /// such a one a short part is watched, and a longer one only if that is free.
+  /// A motion that tears a surface sweeps nearly every pair and is blocked early: a short part of it is
+  /// watched first, and a longer part only if the short one is collision-free.
   double watch_free(const double* x, const double* to);
 
-  /// Fraction of the watched motion x -> to that is certified free of collisions.
+  /// Fraction of the watched motion x -> to that is certified to be collision-free.
   double safe_fraction(const double* x, const double* to) const;
 
-  /// Watch the straight motion x -> to, and find the surfaces that collide on it, or are in contact at its
-  /// end; all of them where it tears one to pieces.  [surfaces]
+  /// Watch the straight motion x -> to, and mark the surfaces that collide on it, or are in contact at
+  /// its end; all surfaces if the motion tears one.  [surfaces]
   std::vector<char> meeting(const double* x, const double* to);
 
   const ContactModel& model() const { return model_; }
@@ -111,22 +112,23 @@ class ContactPotential final : public TouchingPotential {
                              const Products& products) const override;
   void accumulate(const double* x, const double* z) override;
   void add_tangents(const double* x, std::span<double* const> y) const override;
-  void swap_cotangents(CotangentStore& /*store*/) override {}  // they are the caller's
+  void swap_cotangents(CotangentStore& /*store*/) override {}  // owned by the caller
 
-  /// Tangents of the parameters and the rest shape along each direction, null where none changes; they
-  /// outlive the calls of add_tangents().
+  /// Tangents of the parameters and the rest shape along each direction, null for a direction without
+  /// change; must outlive the calls of add_tangents().
   void set_tangents(std::vector<const ContactModel::Bar*> directions) {
     directions_ = std::move(directions);
   }
 
  private:
-  /// What is near at a point.
+  /// Contact terms and energies at a point.
   struct Measured {
-    std::vector<double> x;  ///< all vertices; empty where nothing is known
+    std::vector<double> x;  ///< positions of all vertices; empty: none
     Near near;
   };
   double largest_coordinate(const double* x) const;
-  /// Visit the pairs that may collide on the watched motion x -> to, and their xi, as long as it is wanted.
+  /// Visit the pairs that may collide on the watched motion x -> to, with their xi, until `visit`
+  /// returns false.
   template <class Visit>
   void visit_approaching(const double* x, const double* to, Visit&& visit) const;
   bool is_at(const Measured& measured, const double* x) const;
@@ -137,20 +139,21 @@ class ContactPotential final : public TouchingPotential {
   Detection& detection_;
   ContactModel::Bar* bar_;
   std::vector<const ContactModel::Bar*> directions_;
-  Found found_;                                    ///< by the last watch()
-  std::vector<Contact> contacts_;                  ///< that were found
-  const std::vector<Contact>* adopted_ = nullptr;  ///< where the potential stands at these
-  Measured here_;                                  ///< where the potential stands
-  mutable Measured trial_;  ///< where the energy was last asked for: often where it stands next
+  Found found_;                                    ///< pairs of the last watch()
+  std::vector<Contact> contacts_;                  ///< contacts at here_, if adopted_ is null
+  const std::vector<Contact>* adopted_ = nullptr;  ///< contacts given by adopt(), or null
+  Measured here_;                                  ///< terms at the current point
+  mutable Measured trial_;  ///< terms at the last trial point, which often becomes current
 };
 
 /// Lagged friction as a potential of the displacement over the step. See friction_set.h.
 class FrictionPotential final : public TouchingPotential {
  public:
-  /// @param contacts  of the lag configuration; they outlive the potential
+  /// @param contacts  contacts of the lag configuration; must outlive the potential
   /// @param x_start   positions at the start of the step; likewise
-  /// @param x_lag     those of the lag configuration, which accumulate() and add_tangents() read again
-  /// @param bar       cotangents of the parameters, for accumulate(); null if it differentiates by points alone
+  /// @param x_lag     positions of the lag configuration, which accumulate() and add_tangents() read
+  /// again
+  /// @param bar       cotangents of the parameters, for accumulate(); null: only cotangents of positions
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
                     const double* x_start,
@@ -185,17 +188,17 @@ class FrictionPotential final : public TouchingPotential {
   void expect(const double* x, const double* to) { set_.expect(x, to); }
   void accumulate(const double* x, const double* z) override;
   void add_tangents(const double* x, std::span<double* const> y) const override;
-  void swap_cotangents(CotangentStore& /*store*/) override {}  // the caller takes and swaps them
+  void swap_cotangents(CotangentStore& /*store*/) override {}  // owned by the caller
 
-  /// Tangents along each direction; they outlive the calls of add_tangents().
+  /// Tangents along each direction; must outlive the calls of add_tangents().
   void set_tangents(std::vector<FrictionSet::Tangents> directions) {
     directions_ = std::move(directions);
   }
 
   const FrictionSet& set() const { return set_; }
 
-  std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
-  std::vector<double> lag_bar;    ///< of x_lag, likewise
+  std::vector<double> start_bar;  ///< cotangent of x_start, all vertices; empty until accumulate()
+  std::vector<double> lag_bar;    ///< cotangent of x_lag, likewise
 
  private:
   FrictionSet set_;

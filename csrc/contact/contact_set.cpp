@@ -78,7 +78,7 @@ bool ContactModel::between_bodies(const Candidate& pair) const {
   return surface_a(pair) >= mesh_.cloth_count && surface_b(pair) >= mesh_.cloth_count;
 }
 
-// What multiplies a contact's coefficient to make its weight.
+// Factor between a contact's coefficient and its weight.
 double ContactModel::area(const Candidate& pair) const {
   return between_bodies(pair) ? 1.0 : area(pair, rest_);  // there its coefficient is the weight
 }
@@ -174,8 +174,9 @@ void ContactModel::add_own_term(const Candidate& pair,
   if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = 0.25, .d_sq = d_sq});
 }
 
-/// A point of a skeleton against another skeleton. Of two spheres one has the other; a sphere has the capsule,
-/// whose ends do not cover it; two capsules have each other's ends, besides the segments.
+/// A point of a skeleton against another skeleton. For two spheres one of the two pairs is kept. For a
+/// sphere and a capsule the center against the capsule is kept, because the capsule's ends do not cover
+/// it. For two capsules the ends of each against the other are kept, besides the pair of segments.
 void ContactModel::add_skeleton_term(const Candidate& pair,
                                      const double* x,
                                      std::vector<Term>& out) const {
@@ -204,7 +205,7 @@ void ContactModel::find_terms(std::span<const Candidate> group,
   }
   const double range = parameters_.d_hat + xi(head);
   const Index a = head.vertices[0];
-  // Of a body all vertices are prescribed, or none.
+  // The vertices of a body are all prescribed or all free.
   const bool edges = head.kind == PairKind::kEdgeEdge;
   const bool prescribed_a = prescribed_[a] != 0 && (!edges || prescribed_[head.vertices[1]] != 0);
   const bool body_b = surface_b(head) >= mesh_.cloth_count;
@@ -245,13 +246,13 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
     k.mollifier = mollifier(corner, k.threshold);
   }
   for (int side = 0; side < 2; ++side) {
-    // The distance of one end of an edge: the other one does not take part.
+    // Distance from one end of an edge: collapse the edge to this end.
     const std::int8_t end = term.ends[side];
     if (end >= 0) corner[2 * side + 1 - end] = corner[2 * side + end];
   }
   k.closest = closest(pair.kind, corner);
   for (int side = 0; side < 2; ++side) {
-    // What repeats is taken for its first corner.
+    // closest() assigns a collapsed edge to its first corner: swap if the end is the second.
     if (term.ends[side] != 1) continue;
     k.closest.c.segment<2>(2 * side).reverseInPlace();
     k.closest.c_beta.middleRows<2>(2 * side).colwise().reverseInPlace();
@@ -260,12 +261,12 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
   return k;
 }
 
-/// Those of sorted candidates that are within reach at x, and few more.
+/// Sorted candidates within reach at x, and a few more.
 std::vector<Candidate> ContactModel::near_ones(const std::vector<Candidate>& candidates,
                                                const double* x) const {
-  // More than what distances differ by that are measured otherwise.
+  // Exceeds the relative difference between the two ways to compute a distance.
   constexpr double kClearly = 1.0 + 1e-6;
-  std::vector<double> range_sq;  // of each pair of surfaces
+  std::vector<double> range_sq;  // for each pair of surfaces
   for (const double a : reach_) {
     for (const double b : reach_) range_sq.push_back(kClearly * (a + b) * (a + b));
   }
@@ -296,7 +297,7 @@ void ContactModel::measure(const std::vector<Candidate>& all, const double* x, N
       const Term& term = out.terms[k];
       const double b = barrier(term.d_sq, xi(term.pair), parameters_.d_hat);
       if (b == kInfinity) {
-        // Whatever multiplies it, be it zero for exactly parallel edges, or negative.
+        // Infinite whatever the factor, which may be zero for exactly parallel edges, or negative.
         sum = b;
         break;
       }
@@ -398,7 +399,7 @@ void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
   }
 }
 
-/// A symmetric matrix without its negative eigenvalues.
+/// Symmetric matrix with its negative eigenvalues set to zero.
 Mat12 positive_part(const Mat12& h) {
   const Eigen::SelfAdjointEigenSolver<Mat12> eigen(h);
   const Mat12& vectors = eigen.eigenvectors();
@@ -417,7 +418,7 @@ Mat3 ContactHessian::operator()(int p, int q) const {
 }
 
 void ContactHessian::add_to(linalg::BlockMatrix& A, const std::array<Index, 4>& points) const {
-  // Features of skeletons, and of no other surface, repeat their last point.
+  // Only features of skeletons repeat their last point.
   if (A.any_attached(points) || points[2] == points[3]) {
     A.add_stencil(points, *this);
     return;
@@ -542,7 +543,8 @@ double ContactModel::first_share(const Candidate& pair) const {
   return a > 0.0 && b > 0.0 ? a / (a + b) : -1.0;
 }
 
-// B = kappa w m b, contact by contact. Bodies' shares of areas are constant where features do not change.
+// B = kappa w m b, summed over contacts. The bodies' fractions of areas are constant while features do
+// not change.
 void ContactModel::add_energy_bars(const std::vector<Contact>& contacts,
                                    const double* x,
                                    double scale,

@@ -19,40 +19,40 @@
 
 namespace diffcloth::contact {
 
-/// What a contact's energy depends on besides positions and rest shape.
+/// Parameters of a contact's energy, besides positions and rest shape.
 struct Parameters {
   double d_hat;                   ///< barrier distance [m]
   double slip;                    ///< eps_v h: displacement over a step where sliding begins [m]
   std::vector<double> thickness;  ///< [S] full thickness of each surface [m]
   std::vector<double> kappa;      ///< [S * S] barrier stiffness [Pa]
-  std::vector<double> friction;   ///< [S * S]; of both, a pair uses the mean of its two entries
+  std::vector<double> friction;   ///< [S * S]; a pair uses the mean of its two entries
 };
 
 /// A pair of primitives within reach, with everything its barrier needs.
 struct Contact {
-  Candidate pair;      ///< against bodies, its nearest features: see Term
-  double coefficient;  ///< share of the area, between bodies an area [m^2]; may be negative
+  Candidate pair;      ///< against bodies: nearest features, see Term
+  double coefficient;  ///< fraction of the area, or between bodies the area [m^2]; may be negative
   double weight;       ///< w: coefficient times area [m^2]
-  double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0 where there is none
-  double xi;           ///< distance of touching: half the sum of the thicknesses, and the radii [m]
+  double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0: no mollifier
+  double xi;           ///< touching distance: half the sum of the thicknesses, plus the radii [m]
   double kappa;        ///< barrier stiffness of the two surfaces [Pa]
   Closest closest;
   Barrier barrier;
   double mollifier;  ///< m
-  bool mollified;    ///< m < 1: its derivatives count
+  bool mollified;    ///< true if m < 1: the derivatives of m contribute
 };
 
-/// The pairs of one configuration that are within reach, by their distances: all that the energy
-/// needs, and what its derivatives begin with.
+/// Pairs of one configuration that are within reach, with their distances: sufficient for the energy,
+/// and the start of its derivatives.
 ///
-/// A function of the configuration, whatever candidates it was found among.
+/// Depends on the configuration alone, not on the candidates that were searched.
 struct Near {
-  /// The energy of candidates that act together: one, or those of a point or an edge and a body.
+  /// Energy of candidates that act together: a single one, or all of a point or an edge and a body.
   struct Energy {
     PairKind kind;
     Index a;
     Index surface;
-    Index b;       ///< -1 of a body as a whole
+    Index b;       ///< -1 for a body as a whole
     double value;  ///< [J], not zero; +infinity where d <= xi
   };
   std::vector<Term> terms;       ///< in the order of the candidates
@@ -62,7 +62,7 @@ struct Near {
   double energy() const;
 };
 
-/// Visit the energies of the same pairs in two configurations, 0 where there is none.
+/// Visit the energies of pairs in two configurations side by side; 0 if a pair has none.
 template <class Visit>
 void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
   const auto key = [](const Near::Energy& e) { return std::tie(e.kind, e.a, e.surface, e.b); };
@@ -77,20 +77,20 @@ void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
   }
 }
 
-/// Energy of q minus that of p, pair by pair [J].
+/// Energy of q minus energy of p, summed pair by pair [J].
 double energy_change(const Near& p, const Near& q);
 
-/// The Hessian of one contact by its 3x3 blocks:  sum_k left_k right_k^T + c c^T (x) along I + rest,  the
-/// rest being that of mollifiers.
+/// Hessian of one contact by its 3x3 blocks:  sum_k left_k right_k^T + c c^T (x) along I + rest.  `rest`
+/// is the contribution of mollifiers.
 class ContactHessian {
  public:
   Mat3 operator()(int p, int q) const;
   Vec12 operator*(const Vec12& z) const;
 
-  /// Add it to a matrix.
+  /// Add the Hessian to a matrix.
   void add_to(linalg::BlockMatrix& A, const std::array<Index, 4>& points) const;
 
-  /// What products along several directions are made of; of this Hessian.
+  /// Factors for products along several directions; pointers into this Hessian.
   ContactProduct factors(const std::array<Index, 4>& points) const;
 
  private:
@@ -98,7 +98,7 @@ class ContactHessian {
   Mat12 dense() const;
   void add(const Vec12& left, const Vec12& right);
 
-  int count_ = 0;  ///< of the products
+  int count_ = 0;  ///< number of outer products
   std::array<Vec12, 3> left_;
   std::array<Vec12, 3> right_;
   Vec4 c_ = Vec4::Zero();
@@ -108,26 +108,27 @@ class ContactHessian {
 
 /// Barrier contacts of one configuration: sum of kappa w m b(D; xi, d_hat)  [J].
 ///
-/// Between cloths the sum is over all pairs of a vertex p and a face, w = A_p / 4, and of two edges,
-/// w = (A_a + A_b) / 4. Between a cloth and a body it is over features (see FeatureWeights), so that
-/// it does not know how the body is cut into triangles:
+/// Between cloths the sum is over all pairs of a vertex p and a face, w = A_p / 4, and of two edges, w =
+/// (A_a + A_b) / 4. Between a cloth and a body it is over features (see FeatureWeights), so that it does
+/// not depend on the triangulation of the body:
 ///
 ///   cloth vertex p:  w = A_p / 4            times the sum over the body's features,
 ///   cloth edge c:    w = A_c / 2            times the sum over the body's sharp edges,
 ///   body vertex v:   w = s_v mean(A_f) / 4  times the sum over the cloth's features, with the mean
 ///                                           area of the cloth's faces.
 ///
-/// Between two bodies it is over the features of each that a corner of the other meets, and over pairs
-/// of ridges; areas are those of FeatureWeights.
+/// Between two bodies the sum is over the features of each that a corner of the other meets, and over
+/// pairs of ridges; areas are defined by FeatureWeights.
 ///
-/// Round bodies (see CollisionMesh) are larger by their radius than the skeleton that is in the pairs. They
-/// meet faces of cloths, w = A_f / 4, and edges: see FeatureWeights.
+/// Round bodies (see CollisionMesh) are larger by their radius than the skeleton that is in the pairs.
+/// They meet faces of cloths, w = A_f / 4, and edges: see FeatureWeights.
 ///
-/// Terms that share their nearest features are one contact, whose coefficient is the sum of theirs.
+/// Terms with identical nearest features are merged into one contact, whose coefficient is the sum of
+/// theirs.
 ///
-/// Positions are those of the whole collision mesh, cloth first, then bodies: 3 doubles a vertex.
-/// `prescribed` marks vertices whose motion is given (pins, bodies that dynamics does not move):
-/// features made of them alone carry no energy.
+/// Positions are those of the whole collision mesh, cloths first, then bodies: 3 doubles a vertex.
+/// `prescribed` marks vertices with prescribed motion (pins, bodies that dynamics does not move): pairs
+/// of such vertices alone carry no energy.
 class ContactModel {
  public:
   ContactModel(const CollisionMesh& mesh,
@@ -139,11 +140,11 @@ class ContactModel {
   const Parameters& parameters() const { return parameters_; }
   const CollisionMesh& mesh() const { return mesh_; }
 
-  /// Half the distance at which a surface can interact with one of its own kind:
-  /// (d_hat + thickness) / 2 + radius [m]. A pair can at the sum of both, d_hat + xi.
+  /// Half of the distance at which a surface interacts with its own kind: (d_hat + thickness) / 2 +
+  /// radius [m]. Two surfaces interact up to the sum of their reaches, d_hat + xi.
   const std::vector<double>& reach() const { return reach_; }
 
-  /// Half the sum of the thicknesses of a pair's surfaces, and their radii [m].
+  /// Half the sum of the thicknesses of a pair's surfaces, plus their radii [m].
   double xi(const Candidate& pair) const;
 
   /// Barrier stiffness of a pair's surfaces [Pa].
@@ -152,44 +153,45 @@ class ContactModel {
   /// Friction coefficient of a pair.
   double mu(const Candidate& pair) const { return mean_entry(parameters_.friction, pair); }
 
-  /// What is within reach at x.
+  /// Compute the terms and energies within reach at x.
   ///
-  /// @param candidates  sorted, everything within reach among them
+  /// @param candidates  sorted; must include all pairs within reach
   void measure(const std::vector<Candidate>& candidates, const double* x, Near& out) const;
 
   /// The contacts at x, in the order of the terms.
   void find(const Near& near, const double* x, std::vector<Contact>& out) const;
 
-  /// Whether a surface has vertices whose motion is not given [surfaces].
+  /// True for each surface that has vertices without prescribed motion [surfaces].
   std::vector<char> moving_surfaces() const;
 
-  /// Whether one of some points is no free vertex of a cloth.
+  /// True if any of the points is not a free vertex of a cloth.
   bool is_held(std::span<const Index> points) const;
 
-  /// Whether one of some points belongs to a body or a link whose motion is not given.
+  /// True if any of the points belongs to a body or a link that is dynamic.
   bool is_of_moving_body(std::span<const Index> points) const;
 
   bool between_cloths(const Candidate& pair) const;
 
-  /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, round
-  /// rather than not, at rest rather than moving; between cloths of the triangle, or, of edges that do not
-  /// cross, of a face at the second one.
+  /// Three vertices of one surface of a pair, with which the gap between both rotates. If a body is
+  /// involved: its carriers, of a round body before one that is not, of a prescribed one before a moving
+  /// one. Between cloths: the triangle, or, for edges that do not cross, a face at the second edge.
   std::array<Index, 3> frame(const Candidate& pair) const;
 
-  /// How much of the gap turns with the pair's first surface, the rest with the second: of two round bodies by
-  /// their radii, so that each rolls on its own; negative where all turns with frame().
+  /// Fraction of the gap that rotates with the pair's first surface, the rest with the second: for two
+  /// round bodies by their radii, so that each rolls independently; negative if the whole gap rotates
+  /// with frame().
   double first_share(const Candidate& pair) const;
 
-  /// Three vertices that say how a body turns.
+  /// Three vertices that define the orientation of a body.
   const std::array<Index, 3>& carriers(Index surface) const { return weights_.carriers(surface); }
 
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// Hessian of one contact; kPositive is its positive part, and zero if its weight is negative.
+  /// Hessian of one contact. kPositive: its positive part, which is zero if the weight is negative.
   ContactHessian hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
-  /// Cotangents of what the energy depends on.
+  /// Cotangents of parameters and rest shape.
   struct Bar {
     double d_hat = 0.0;
     double slip = 0.0;
@@ -214,8 +216,8 @@ class ContactModel {
                  double scale,
                  Bar& bar) const;
 
-  /// y += d/d(theta) (grad B) theta_dot along each direction, for tangents of every theta of Bar: add_mixed(),
-  /// transposed.
+  /// y += d/d(theta) (grad B) theta_dot along each direction, for tangents of every theta of Bar: the
+  /// transpose of add_mixed().
   void add_tangents(const std::vector<Contact>& contacts,
                     const double* x,
                     std::span<const Bar* const> directions,
@@ -233,7 +235,7 @@ class ContactModel {
     return mean_entry(dot.friction, pair);
   }
 
-  /// Pull cotangents of a contact's weight, mollifier threshold and xi back to rest and thickness.
+  /// Pull cotangents of a contact's weight, mollifier threshold and xi back to rest shape and thickness.
   void pull_back(const Contact& contact,
                  double weight_bar,
                  double threshold_bar,
@@ -247,18 +249,19 @@ class ContactModel {
   }
 
  private:
-  /// Whether a pair is of a point of a skeleton and a face of a cloth.
+  /// True if a pair joins a point of a skeleton and a face of a cloth.
   bool is_round_on_cloth(const Candidate& pair) const {
     return pair.kind == PairKind::kPointTriangle && mesh_.is_round_vertex(pair.vertices[0]) &&
            surface_b(pair) < mesh_.cloth_count;
   }
-  /// Whether a candidate is a term of its own.
+  /// True if a candidate forms a term by itself.
   bool is_alone(const Candidate& pair) const {
     return between_cloths(pair) || is_round_on_cloth(pair);
   }
   std::vector<Candidate> near_ones(const std::vector<Candidate>& candidates, const double* x) const;
   void add_skeleton_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
-  /// Candidates that act together: one, or those of a point or an edge and a body.
+  /// End of the group of candidates that act together: a single one, or all of a point or an edge and a
+  /// body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;
   bool between_bodies(const Candidate& pair) const;
   void find_terms(std::span<const Candidate> group,
@@ -266,11 +269,11 @@ class ContactModel {
                   MergeScratch& scratch,
                   std::vector<Term>& out) const;
   void add_own_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
-  /// Mean of the two entries that a pair's surfaces have among values [S * S].
+  /// Mean of the two entries of a pair's surfaces in values [S * S].
   double mean_entry(const std::vector<double>& values, const Candidate& pair) const;
   void pull_back_mean_entry(const Candidate& pair, double mean_bar, std::vector<double>& bar) const;
   double area(const Candidate& pair) const;
-  /// What rest measures, or their tangents, make of it; not between bodies.
+  /// Area from rest measures, or its tangent from their tangents; not between bodies.
   double area(const Candidate& pair, const RestMeasures& rest) const;
   void pull_back_area(const Contact& contact, double area_bar, RestMeasures& rest) const;
   double threshold(const Candidate& pair) const;

@@ -8,7 +8,7 @@
 
 namespace diffcloth::contact {
 
-/// Vectors over all points, side by side; those beyond the given ones are zero.
+/// Vectors over all points, side by side; unused lanes are zero.
 class DirectionRows {
  public:
   DirectionRows(const DirectionKernels& kernels, std::size_t size)

@@ -26,7 +26,8 @@ DIFFCLOTH_INLINE void load(const double* from, Pack& to) {
 DIFFCLOTH_INLINE void store(double* to, double from) { *to = from; }
 DIFFCLOTH_INLINE void store(double* to, const Pack& from) { *reinterpret_cast<Stored*>(to) = from; }
 
-/// Over numbers of one direction, or of as many as a Pack has, of kStride that lie side by side.
+/// Arithmetic of one direction, or of one Pack of directions, in rows of kStride directions side by
+/// side.
 template <class Number, int kStride>
 struct Directions {
   struct Vector {
@@ -55,14 +56,14 @@ struct Directions {
   static DIFFCLOTH_INLINE Vector scaled(double s, const Vector& a) {
     return {{s * a.at[0], s * a.at[1], s * a.at[2]}};
   }
-  /// A vector that all directions share, by a number of each.
+  /// Shared vector times one number per direction.
   static DIFFCLOTH_INLINE Vector along(const double* v, const Number& s) {
     return {{v[0] * s, v[1] * s, v[2] * s}};
   }
   static DIFFCLOTH_INLINE Number dot(const double* a, const Vector& b) {
     return a[0] * b.at[0] + a[1] * b.at[1] + a[2] * b.at[2];
   }
-  /// a x b and b x a, for an a that all directions share.
+  /// a x b and b x a, for a vector `a` shared by all directions.
   static DIFFCLOTH_INLINE Vector cross(const double* a, const Vector& b) {
     return {{a[1] * b.at[2] - a[2] * b.at[1], a[2] * b.at[0] - a[0] * b.at[2],
              a[0] * b.at[1] - a[1] * b.at[0]}};
@@ -162,7 +163,7 @@ struct Directions {
                                const double* start,
                                const double* by_parameters,
                                double* y) {
-    // What the lag configuration gives: the coefficients c, the normal and its force.
+    // Derivatives by the lag configuration: the coefficients c, the normal and its force.
     Vector x[4];
     Vector t = zero();
     Number share{};
@@ -171,7 +172,7 @@ struct Directions {
       t = sum(t, scaled(of.corner_c[i], x[i]));
       share += dot(of.by_corners + 3 * i, x[i]);
     }
-    // The vector from one contact point to the other at the start: from the first point.
+    // Vector between the contact points at the start, relative to the first point.
     const Vector origin = row(start, of.point[0]);
     Vector r = zero();
     for (int i = 1; i < of.count; ++i) {

@@ -13,10 +13,10 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Sine of the largest angle at which two edges are still one line: what is flat is so within it.
+/// Sine of the largest angle at which two edges still form one line: the tolerance of flatness.
 constexpr double kStraight = 1e-4;
 
-/// The facet of every face, by one of its faces.
+/// Facet of every face, identified by one of its faces.
 std::vector<Index> find_facets(const CollisionMesh& mesh, const Bulge& bulge) {
   DisjointSets sets(mesh.faces.size());
   for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
@@ -27,7 +27,7 @@ std::vector<Index> find_facets(const CollisionMesh& mesh, const Bulge& bulge) {
   return facet;
 }
 
-/// The two facets of every edge, the lower first; -1 where there is none.
+/// Facets at every edge, the lower first; -1 if missing.
 std::vector<std::array<Index, 2>> facets_of_edges(const CollisionMesh& mesh,
                                                   const std::vector<Index>& facet) {
   std::vector<std::array<Index, 2>> result;
@@ -42,7 +42,7 @@ std::vector<std::array<Index, 2>> facets_of_edges(const CollisionMesh& mesh,
   return result;
 }
 
-/// The ridge of every edge of a body, by one of its edges.
+/// Ridge of every edge of a body, identified by one of its edges.
 std::vector<Index> find_ridges(const CollisionMesh& mesh,
                                const double* X,
                                const Bulge& bulge,
@@ -91,7 +91,7 @@ FeatureAreas feature_areas(const CollisionMesh& mesh, const double* X, const Bul
                       .edge = std::vector<double>(mesh.edges.size(), 0.0),
                       .surface = std::vector<double>(mesh.surface_count(), 0.0)};
   const std::vector<Index> facet = find_facets(mesh, bulge);
-  std::vector<double> area(mesh.faces.size(), 0.0);  // of facets, as what follows
+  std::vector<double> area(mesh.faces.size(), 0.0);  // of facets, as the next two
   std::vector<double> angle(mesh.faces.size(), 0.0);
   std::vector<double> perimeter(mesh.faces.size(), 0.0);
   const auto for_each_corner = [&](auto&& visit) {

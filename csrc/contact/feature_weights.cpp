@@ -11,8 +11,8 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Sharpness of a segment that is round: edges then have a quarter of their area against it, as vertices
-/// have against a face.
+/// Sharpness of the segment of a round body: it gives edges a quarter of their area, the weight of
+/// vertices against a face.
 constexpr float kOfAxis = 0.5F;
 
 double smoothstep(double t) {
@@ -20,8 +20,8 @@ double smoothstep(double t) {
   return u * u * (3.0 - 2.0 * u);
 }
 
-/// @param angle  where a surface begins to count as sharp: radians
-/// @param share  of the sharpest
+/// @param angle  dihedral angle, or square root of the solid angle [rad]
+/// @param share  sharpness before clipping and smoothing
 /// @param ratio  the cloth's edge length over the width of the feature
 float sharpness(double angle, double share, double ratio) {
   if (angle == 0.0) return 0.0F;
@@ -40,7 +40,7 @@ std::vector<double> mean_edge_length(const CollisionMesh& mesh, const RestMeasur
   return length;
 }
 
-/// For both ends of every body edge, how much another sharp edge continues it there.
+/// Continuation by another sharp edge, at both ends of every body edge.
 std::vector<std::array<float, 2>> continuations(const CollisionMesh& mesh,
                                                 const double* X,
                                                 const std::vector<double>& edge_angle) {
@@ -71,7 +71,7 @@ std::vector<std::array<float, 2>> continuations(const CollisionMesh& mesh,
   return result;
 }
 
-/// Weights of the features of all faces but those of the cloths whose corners are all left out.
+/// Feature weights of all faces, except cloth faces whose corners are all left out.
 FeatureWeights::Features count_features(const CollisionMesh& mesh,
                                         const std::vector<char>& left_out) {
   FeatureWeights::Features w{.counts = std::vector<char>(mesh.faces.size(), 1),
@@ -94,10 +94,11 @@ FeatureWeights::Features count_features(const CollisionMesh& mesh,
   return w;
 }
 
-/// For every body a vertex, the one farthest from it, and the one farthest from the line of both.
+/// For every body its first vertex, the vertex farthest from it, and the vertex farthest from the line
+/// through both.
 std::vector<std::array<Index, 3>> carriers_of_bodies(const CollisionMesh& mesh, const double* X) {
   std::vector<std::array<Index, 3>> result;
-  // Of vertices at one distance the first, whatever the rounding of a frame or unit.
+  // Among equidistant vertices the first is chosen, whatever the rounding of a frame or unit.
   constexpr double kClearly = 1.0 + 1e-9;
   const auto farthest = [](Index first, Index last, auto&& distance_sq) {
     Index best = first;

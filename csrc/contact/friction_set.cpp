@@ -12,19 +12,22 @@ using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
 using GapPart = FrictionSet::GapPart;
 
-/// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
+/// Bound of |m|^2 over |e1|^2 |e2|^2 below which a frame is degenerate: its edges are parallel to
+/// rounding.
 constexpr double kLine = 1e-24;
-/// Duals that are all this close to the forces at the point are of no further use: Newton's method converges.
+/// Duals that all differ from the forces at the point by at most this are dropped: Newton's method
+/// converges without duals.
 constexpr double kClose = 0.1;
-/// How much of the normal is along itself at least where it turns with the gap: no gap gets longer than by
-/// twice what it lacks, however its frame turns in a step. The slip has a kink there in x_start and x_lag.
+/// Lower bound of n . Q n in the extension of the gap: the gap is extended at most by twice its missing
+/// length, however its frame rotates in a step. The slip has a kink at this bound in x_start and x_lag.
 constexpr double kLeastAlong = 0.5;
-/// Squared sine of the angle from which on two edges cross.
+/// Squared sine of the angle above which two edges cross.
 constexpr double kCrossing = 0.2;
 
 void add_part(const GapPart& part, Entry& entry) { entry.parts[entry.part_count++] = part; }
 
-/// Append three vertices as a frame; what the corners of the pair have among them is theirs.
+/// Append three vertices as a frame; a vertex that is also a corner of the pair gets the corner's
+/// coefficient.
 void append_frame(const std::array<Index, 3>& frame, double share, Entry& entry) {
   const auto& v = entry.lag.pair.vertices;
   const Vec4& c = entry.lag.closest.c;
@@ -42,7 +45,7 @@ void append_frame(const std::array<Index, 3>& frame, double share, Entry& entry)
       entry);
 }
 
-/// Let the edges of a pair be the frame.
+/// Use the edges of a pair as the frame.
 void turn_with_edges(Entry& entry) {
   const auto& v = entry.lag.pair.vertices;
   const Vec4& c = entry.lag.closest.c;
@@ -53,7 +56,7 @@ void turn_with_edges(Entry& entry) {
   add_part({.first = 0, .size = 4, .edges = {0, 1, 2, 3}, .share = 1.0}, entry);
 }
 
-/// Let three vertices be the frame.
+/// Use three vertices as the frame.
 void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
   const auto& v = entry.lag.pair.vertices;
   const Vec4& c = entry.lag.closest.c;
@@ -66,7 +69,7 @@ void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
   append_frame(frame, 1.0, entry);
 }
 
-/// Let two round bodies each be a frame; their skeletons are among its vertices.
+/// Use a frame of each of two round bodies; their skeletons are among its vertices.
 void turn_with_both(const ContactModel& model, double share, Entry& entry) {
   const auto& v = entry.lag.pair.vertices;
   const std::vector<Index>& surface = model.mesh().vertex_surface;
@@ -74,7 +77,7 @@ void turn_with_both(const ContactModel& model, double share, Entry& entry) {
   append_frame(model.carriers(surface[v[3]]), 1.0 - share, entry);
 }
 
-/// The change of s with z, at frames.
+/// Change of s with z, at given frames.
 Vec3 change_of_slip(const Entry& k, const std::array<Frame, 2>& frames, const double* z) {
   Vec3 change = k.gap(z);
   for (int l = 0; l < k.part_count; ++l) {
@@ -91,7 +94,7 @@ std::array<Vec3, 2> sum(const std::array<Vec3, 2>& a, const std::array<Vec3, 2>&
   return {a[0] + b[0], a[1] + b[1]};
 }
 
-/// The matrix of v -> u x v.
+/// Matrix of v -> u x v.
 Mat3 cross_matrix(const Vec3& u) {
   return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
 }
@@ -258,7 +261,7 @@ const FrictionSet::Slips& FrictionSet::slips(const double* x) const {
 
 FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
   Slip at;
-  // By displacements, of which little is lost: sum_i c_i delta_i less the change of E a.
+  // From displacements, which avoids cancellation: sum_i c_i delta_i minus the change of E a.
   std::array<Vec3, 7> delta;
   Vec3 s = Vec3::Zero();
   for (int i = 0; i < k.count; ++i) {
@@ -283,7 +286,7 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
 
 double FrictionSet::energy_change(const double* x0, const double* x1) const {
   const Slips& end = slips(x1);
-  const Slips& start = slips(x0);  // both are kept
+  const Slips& start = slips(x0);  // both are cached
   double change = 0.0;
   for (std::size_t i = 0; i < entries_.size(); ++i) {
     change += entries_[i].mu * entries_[i].lambda * (end[i].law.f0 - start[i].law.f0);
@@ -308,7 +311,7 @@ void FrictionSet::add_gradient(const Entry& k, const Slip& at, double* g) const 
 }
 
 void FrictionSet::expect(const double* x, const double* to) {
-  // Prescribed points may have moved by any fraction t of their motion while the cloth slips: the slip is
+  // Prescribed points may complete any fraction t of their motion while the cloth slips: the slip is
   // w(t) = w(0) + t (w(1) - w(0)).
   std::vector<double> held(points_.empty() ? 0
                                            : 3 * (static_cast<std::size_t>(points_.back()) + 1));
@@ -339,7 +342,7 @@ double FrictionSet::stiffness(std::size_t entry, const Slip& at) const {
 
 void FrictionSet::update_duals(const double* x, const double* p, double alpha, const double* to) {
   const Slips& end = slips(to);
-  const Slips& start = slips(x);  // both are kept
+  const Slips& start = slips(x);  // both are cached
   const bool go_on = has_duals(x);
   std::vector<Vec3> duals(entries_.size());
   bool any = false;
@@ -414,7 +417,7 @@ std::array<Mat3, 6> FrictionSet::Hessian::frame_changes() const {
 }
 
 Mat3 FrictionSet::Hessian::turning(int p, int q) const {
-  // Between e1 and e2 turn x, between e2 and e1 the opposite.
+  // Block of (e1, e2): cross product with `turn`; block of (e2, e1): its negative.
   const auto in = [](const GapPart& part, int i) {
     return i >= part.first && i < part.first + part.size;
   };
@@ -432,7 +435,7 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const int first = k.frame;
   const std::span<const Index> others = k.all_points().first(static_cast<std::size_t>(first));
   if (!A.has_any(k.all_points().subspan(others.size())) && !A.any_attached(others)) {
-    // The frames are of bodies whose motion is given.
+    // All frames belong to bodies with prescribed motion.
     A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
     return;
   }
@@ -454,9 +457,9 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     }
     return;
   }
-  // As between cloths: one part of the gap turns with vertices of one of them.
+  // Case of two cloths: one part of the gap, which rotates with vertices of one cloth.
   const GapPart& part = k.parts[0];
-  Eigen::Matrix<double, 3, 16, Eigen::RowMajor> change;  // of s with the points
+  Eigen::Matrix<double, 3, 16, Eigen::RowMajor> change;  // change of s with the points
   change.setZero();
   linalg::StencilTerms of;
   for (int p = 0; p < k.count; ++p) {
@@ -510,7 +513,7 @@ void FrictionSet::add_product(const Entry& k,
     const GapPart& part = k.parts[l];
     if (!part.turns) continue;
     auto [e1_bar, e2_bar] = at.frames[l].pull_back(-part.a, force);
-    // As the frame itself turns.
+    // Second derivative of the frame's rotation.
     const Vec3 turn = (part.a[2] * strength) * at.force();
     const Frame turned(k, part, z);
     e1_bar += turn.cross(turned.e2);
@@ -521,8 +524,8 @@ void FrictionSet::add_product(const Entry& k,
 
 namespace {
 
-/// Pull the cotangent of a normal force back. Returns the cotangents of the corners; adds the cotangents of the
-/// parameters, times scale, to `bar` if parameters are chosen.
+/// Pull the cotangent of a normal force back. Returns the cotangents of the corners; if parameters are
+/// chosen, adds the cotangents of the parameters, times scale, to `bar`.
 ///
 ///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
 Vec12 pull_back_lambda(const ContactModel& model,
@@ -566,14 +569,14 @@ void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar
 
 }  // namespace
 
-// With what the lag configuration has marked by L, Q = E_L E(x_start)^-1 of each part, and r" = r' but for a frame
-// that turns so far that n . Q n has its least value, where it is r(x_start):
+// With L marking the lag configuration, Q = E_L E(x_start)^-1 for each part, and r" = r', or r" =
+// r(x_start) if the frame rotates so far that n . Q n is clamped:
 //
 //   l max(n . Q n, 1/2) = d - n . Q r(x_start)
 //   dl = (n . dt - dn . (Q r" + l Q^T n) - n . Q dr - n . dQ r") / (n . Q n),   dr of r(x_start),
 //   n . dQ r" = n . dE_L b" - Q^T n . dE(x_start) b",   b" = E(x_start)^-1 share r",
 //
-// without the term l Q^T n in the second case.
+// without the term l Q^T n in the clamped case.
 FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& k) const {
   const Vec3& n = k.n;
   const Vec3 turned = k.turned(n);
@@ -600,20 +603,20 @@ FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& 
   return by;
 }
 
-// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a - E_L b,  zeta = r(z) - E'(z) a,
-// with E = (e1, e2, m), its change E' with z, a = E_L^-1 share t and b = E(x_start)^-1 share r'; of two parts both.
+// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a - E_L b,  zeta = r(z) - E'(z)
+// a, with E = (e1, e2, m), its change E' with z, a = E_L^-1 share t and b = E(x_start)^-1 share r';
+// summed over both parts if there are two.
 //
 //   dphi/dw    = mu lambda (q zeta + f2 (w . zeta) w) =: omega      (f2 = q'/y)
 //   dphi/ds    = P omega,   dphi/dn = -(n.s) omega - (n.omega) s,   dphi/dzeta = mu lambda q w =: eta
 //   dphi/da = -E^T P omega - E'^T eta,   dphi/dt = share y + beta n,   y = E_L^-T dphi/da
-//   dphi/d(Q r') = -V = -(P omega + beta n),   beta = -(P omega) . Q n / (n . Q n) by what l does
+//   dphi/d(Q r') = -V = -(P omega + beta n),   beta = -(P omega) . Q n / (n . Q n) through l
 //   dphi/dr(x_start) = -Q^T V =: h,   dphi/dn += l h - beta Q r'
 //   dphi/dc_i  = (P omega) . x_i + eta . z_i + h . x_start_i,   dphi/dx_start = c_i h
 //
-// less what the edges of frames have in E_L a, Q b and E(x_start) b; where n . Q n has its least value, l does not
-// change with it (see extension_derivative()),
-// and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
-// dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
+// minus the contributions of frame edges through E_L a, Q b and E(x_start) b; if n . Q n is clamped, l
+// does not depend on it (see extension_derivative()). The lag configuration changes c through d(beta) =
+// J dx, n through dn = P dt / d with dt = sum c_i dx_i + s d(beta), and lambda as in pull_back_lambda().
 void FrictionSet::add_mixed(
     const double* x, const double* z, double scale, DiffWrt inputs, const Cotangents& out) const {
   const Slips& here = slips(x);
@@ -646,7 +649,7 @@ void FrictionSet::add_mixed(
 
     Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag_, lambda_bar, scale, inputs, out.parameters);
 
-    // The frame at the start, c and n.
+    // Cotangents of the frame at the start, of c and of n.
     const double strength = k.mu * k.lambda;
     const Vec3 omega = strength * (law.f1_over_y * zeta + law.f2 * w_zeta * at.w);
     const Vec3 eta = (strength * law.f1_over_y) * at.w;

@@ -1,10 +1,10 @@
-// How the gradient of lagged friction changes with what it depends on besides x, in the terms of friction_set.h:
+// Tangent of the gradient of lagged friction by its inputs besides x, in the notation of friction_set.h:
 //
 //   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a - E_L b,
-//   a = E_L^-1 share t,   b = E(x_start)^-1 share r',   r' = r(x_start) + l n,   of each part.
+//   a = E_L^-1 share t,   b = E(x_start)^-1 share r',   r' = r(x_start) + l n,   for each part.
 //
-// Of each contact everything that belongs to no direction is made once; directions go through the rest side by
-// side: see direction_lanes_impl.h.
+// Factors of a contact that are common to all directions are computed once; the rest processes
+// directions side by side: see direction_lanes_impl.h.
 
 #include <array>
 #include <cmath>
@@ -21,7 +21,7 @@ using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
 using GapPart = FrictionSet::GapPart;
 
-/// How the normal force changes,  lambda = -2 d kappa w m b'(D).
+/// Derivative of the normal force,  lambda = -2 d kappa w m b'(D).
 class NormalForceDerivative {
  public:
   NormalForceDerivative(const Contact& lag, const Vec12& d_sq_gradient, const double* x_lag)
@@ -56,7 +56,7 @@ class NormalForceDerivative {
 
 void copy(const Vec3& from, double* to) { Eigen::Map<Vec3>{to} = from; }
 
-/// What the nearest points make of the motion of the lag configuration, where they slide.
+/// Fill in the derivatives through sliding of the closest points of the lag configuration.
 void fill_sliding(const Entry& k, const double* x, const double* x_start, FrictionTangent& out) {
   const Closest& geometry = k.lag.closest;
   Eigen::Matrix<double, 2, 12> beta = beta_jacobian(geometry);
@@ -81,7 +81,7 @@ void fill_sliding(const Entry& k, const double* x, const double* x_start, Fricti
   }
 }
 
-/// What the frame of a part makes of the motion of the lag configuration and the start.
+/// Fill in the derivatives through the frame of a part, at the lag configuration and at the start.
 void fill_part(const Entry& k,
                const FrictionSet::GapPart& part,
                const Frame& frame,
@@ -115,7 +115,7 @@ void fill_part(const Entry& k,
   copy(force.cross(frame.e1), out.force_e1);
 }
 
-/// The derivative of one contact's friction.
+/// Derivative of the friction of one contact.
 class EntryDerivative {
  public:
   EntryDerivative(const ContactModel& model,
@@ -162,7 +162,7 @@ class EntryDerivative {
     }
   }
 
-  /// What the share of w grows by with parameters.
+  /// Change of the coefficient of w with parameters.
   double by_parameters(const ContactModel::Bar& dot) const {
     const double lambda_dot =
         normal_force_.by_parameters(model_.push_forward(k_.lag, dot), dot.d_hat);

@@ -13,10 +13,10 @@ namespace {
 using Part = MergeScratch::Part;
 using NearEdge = MergeScratch::NearEdge;
 
-/// How near to its border a projection counts as on it, as a share of a triangle or edge, or of the
-/// distance of the point where that is more. Two faces at an edge, each with its own rounding, would
-/// else both claim the point above it. What the distance loses is the square of this, and drowns in
-/// rounding.
+/// Tolerance within which a projection counts as on the border, relative to the size of a triangle or
+/// edge, or to the distance of the point if larger. Without it two faces at an edge, each with its own
+/// rounding, could both contain the projection of the same point. The error of the distance is of the
+/// order of the squared tolerance, below rounding.
 constexpr double kBorder = 1e-12;
 
 /// Squared distances that differ by this factor differ by more than rounding.
@@ -38,15 +38,15 @@ NearEdge nearest_on_edge(const CollisionMesh& mesh, Index edge, const Vec3& p, c
   return {.edge = edge, .vertex = -1, .d_sq = (w - (along / length_sq) * e).squaredNorm()};
 }
 
-/// Whether edge a of a triangle is nearer than edge b. The inside of an edge is nearer than its end,
-/// which another edge may find, even if rounding does not tell their distances apart.
+/// True if edge a of a triangle is nearer than edge b. At equal distance to rounding, the inside of an
+/// edge precedes the end of another edge.
 bool is_nearer(const NearEdge& a, const NearEdge& b) {
   constexpr double kTie = 1e-15;
   const double tie = static_cast<int>(a.vertex < 0) * kTie - static_cast<int>(b.vertex < 0) * kTie;
   return a.d_sq < b.d_sq * (1.0 + tie);
 }
 
-/// Faces whose normals differ by a smaller angle [rad] are parts of one plane.
+/// Faces whose normals differ by a smaller angle [rad] are coplanar.
 constexpr double kCoplanar = 1e-9;
 
 Vec3 normal(const CollisionMesh& mesh, Index f, const double* x) {
@@ -54,7 +54,7 @@ Vec3 normal(const CollisionMesh& mesh, Index f, const double* x) {
   return (row(x, j) - row(x, i)).cross(row(x, k) - row(x, i));
 }
 
-/// Whether a face and its only neighbor at an edge lie in one plane.
+/// True if a face and its only neighbor at an edge lie in one plane.
 bool is_flat(const CollisionMesh& mesh,
              const FeatureWeights::Features& features,
              Index face,
@@ -70,10 +70,11 @@ bool is_flat(const CollisionMesh& mesh,
 
 enum class Projection : std::uint8_t { kOutside, kInside, kOnFlatBorder };
 
-/// Where a point's projection on the plane of a face lies; if not outside, also its squared distance.
+/// Locate a point's projection on the plane of a face; unless outside, also compute its squared
+/// distance.
 ///
-/// On a border that runs through a plane the point is above the plane, and no edge: the second
-/// derivatives of the distance from that edge are none of this surface.
+/// On a border between two coplanar faces the point belongs to the plane, not to an edge: the second
+/// derivatives of the distance from that edge do not belong to this surface.
 Projection project(const CollisionMesh& mesh,
                    const FeatureWeights::Features& features,
                    Index face,
@@ -90,7 +91,7 @@ Projection project(const CollisionMesh& mesh,
   const double b1 = e0.cross(w).dot(n);
   const double longest_sq = std::max(e0.squaredNorm(), e1.squaredNorm());
   const double least = kBorder * std::sqrt(n_sq * std::max(n_sq, longest_sq * w.squaredNorm()));
-  // Times |n|^2, of the sides in the order of the face's edges.
+  // In units of 1 / |n|^2, for the sides in the order of the face's edges.
   const std::array<double, 3> from_side{b1, n_sq - b0 - b1, b0};
   Projection result = Projection::kInside;
   for (int side = 0; side < 3; ++side) {
@@ -108,8 +109,8 @@ Projection project(const CollisionMesh& mesh,
   return result;
 }
 
-/// Return true if the projection of a point lies inside a triangle and the point is farther than `range` from all
-/// edges: within `range` there is then only the inside.
+/// True if the projection of a point lies inside a triangle and the point is farther than `range` from
+/// all edges: the interior then is the only feature within `range`.
 bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
   const Vec3 e0 = b - a;
   const Vec3 e1 = c - a;
@@ -118,7 +119,7 @@ bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, d
   const double n_sq = n.squaredNorm();
   const double b0 = w.cross(e1).dot(n);
   const double b1 = e0.cross(w).dot(n);
-  // The way along the plane to a side is from_side / (|n| |side|).
+  // The in-plane distance to a side is from_side / (|n| |side|).
   const double least = 2.0 * range * std::sqrt(n_sq);
   const auto is_clear = [&](double from_side, const Vec3& side) {
     return from_side > 0.0 && from_side * from_side > least * least * side.squaredNorm();
@@ -143,7 +144,7 @@ bool is_beyond(const Corners& x, double range) {
   return false;
 }
 
-/// Add up the parts of each feature; those within range and not zero come first in the list.
+/// Sum the parts of each feature; drop parts beyond range and sums of zero.
 void merge(std::vector<Part>& parts, double range) {
   const auto key = [](const Part& p) { return std::tuple(p.kind, p.id, p.ends[1], p.ends[0]); };
   std::erase_if(parts, [&](const Part& p) { return !(p.d_sq < range * range); });
@@ -168,7 +169,7 @@ double weight(const CollisionMesh& mesh, const FeatureWeights& weights, Index c,
                                     : weights.edge_pair_area(c, e);
 }
 
-/// The end of an edge that has all of its closest point's weight; -1 if each has a part.
+/// End of an edge that has the full weight of its closest point; -1 if both ends have weight.
 std::int8_t end_of(double c0, double c1) {
   if (c1 == 0.0) return 0;
   return c0 == 0.0 ? std::int8_t{1} : std::int8_t{-1};
@@ -180,8 +181,8 @@ void sort_unique(Values& values) {
   values.erase(std::unique(values.begin(), values.end()), values.end());
 }
 
-// How parts merge, in a section across two faces f and g that meet in an edge e. Each face gives what is
-// nearest to p on it, and each edge and vertex itself, with the weights of FeatureWeights:
+// Merging of parts, in a section across two faces f and g that meet in an edge e. Each face contributes
+// its point nearest to p, and each edge and vertex its own, with the weights of FeatureWeights:
 //
 //           p                      p above f                       p above e
 //           .                      face f    +1 f                  face f    +1 e
@@ -190,16 +191,16 @@ void sort_unique(Values& values) {
 //        f          \              ------------------              ------------------
 //                  g \ .           sum       +1 f                  sum       +1 e
 //
-// Likewise the edges c and c' of a body that continue each other in a vertex v, against an edge e to which v
-// is nearest. Each counts as a whole, less half of each end that is continued:
+// Similarly for edges c and c' of a body that continue each other in a vertex v, against an edge e to
+// which v is nearest. Each contributes as a whole, minus half of each continued end:
 //
 //     ====c=====v=====c'====       c,  whole  +1 (v, e)   its end  -1/2 (v, e)
 //               .                  c', whole  +1 (v, e)   its end  -1/2 (v, e)
 //               e                  sum        +1 (v, e)
 //
-// So the nearest feature counts once, however a surface is cut into triangles; all others cancel.
+// The nearest feature therefore counts once, regardless of the triangulation; all others cancel.
 
-/// The faces of a group that are within range of a point, and their edges.
+/// Find the faces of a group that are within range of a point, and their edges.
 void find_faces_and_edges(const CollisionMesh& mesh,
                           const FeatureWeights::Features& features,
                           std::span<const Candidate> group,
@@ -215,7 +216,8 @@ void find_faces_and_edges(const CollisionMesh& mesh,
       continue;
     faces.push_back(pair.b);
   }
-  // What comes within range has all of its faces within range: their features are all.
+  // A feature within range has all of its faces within range, so that the features of these faces are
+  // complete.
   vertices.clear();
   for (const Index f : faces) {
     vertices.insert(vertices.end(), mesh.face_edges[f].begin(), mesh.face_edges[f].end());
@@ -234,7 +236,7 @@ void find_vertices(const CollisionMesh& mesh, MergeScratch& scratch) {
   sort_unique(vertices);
 }
 
-/// What a point has against faces alone.
+/// Parts of a point against faces alone.
 void list_face_parts(const CollisionMesh& mesh,
                      const FeatureWeights::Features& features,
                      const Vec3& p,
@@ -249,7 +251,7 @@ void list_face_parts(const CollisionMesh& mesh,
   }
 }
 
-/// What a point has against each of the features that have been found.
+/// Parts of a point against each of the features found.
 void list_point_parts(const CollisionMesh& mesh,
                       const FeatureWeights::Features& features,
                       const Vec3& p,
@@ -291,7 +293,8 @@ void list_point_parts(const CollisionMesh& mesh,
   }
 }
 
-/// What remains of a border in a plane is of the first face there that has the point above it.
+/// Assign the remaining part of a border between coplanar faces to the first face that contains the
+/// projection.
 void move_to_plane(const CollisionMesh& mesh,
                    const FeatureWeights::Features& features,
                    const std::vector<Index>& faces,
@@ -313,7 +316,7 @@ void move_to_plane(const CollisionMesh& mesh,
   }
 }
 
-/// A point against the feature of a part.
+/// Pair of a point and the feature of a part.
 Candidate point_pair(const CollisionMesh& mesh, Index point, const Part& part) {
   Candidate pair{.kind = PairKind::kPointTriangle,
                  .vertices = {point, part.id, part.id, part.id},
@@ -330,7 +333,7 @@ Candidate point_pair(const CollisionMesh& mesh, Index point, const Part& part) {
   return pair;
 }
 
-/// One edge c against one edge e of a body, and the parts that they have.
+/// One edge c against one edge e of a body, with their parts.
 class EdgePair {
  public:
   EdgePair(const CollisionMesh& mesh,
@@ -361,7 +364,7 @@ class EdgePair {
 
  private:
   void push(std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
-    // An end that is not continued has nothing to merge with.
+    // An end that is not continued has no other part to merge with.
     if (end_c >= 0 && weights_.end_share(false, pair_.a, end_c) == 0.0) end_c = -1;
     const bool shared = end_e >= 0 && !soft_;
     parts_.push_back({.kind = soft_ ? kMollified : (shared ? kVertex : kEdge),
@@ -371,7 +374,7 @@ class EdgePair {
                       .d_sq = d_sq});
   }
 
-  /// What c as a whole, or its end, does to e and to its ends.
+  /// Add the parts of c as a whole, or of its end, against e and the ends of e.
   void push_against_e(std::int8_t end_c, double coefficient) {
     Corners at = corner_;
     if (end_c >= 0) at[0] = at[1] = corner_[end_c];
@@ -409,7 +412,7 @@ class EdgePair {
   std::vector<Part>& parts_;
 };
 
-/// Edge c against the feature of a part.
+/// Term of edge c and the feature of a part.
 Term edge_term(const CollisionMesh& mesh, Index c, const Part& part, double scale) {
   const auto& [i, j] = mesh.edges[c];
   Candidate pair{
@@ -452,7 +455,7 @@ void add_point_terms(const CollisionMesh& mesh,
   }
   find_faces_and_edges(mesh, features, group, x, range, scratch);
   if (scratch.faces.empty()) return;
-  // What no edge is near to, no vertex is, and inside of a face it has nothing else.
+  // If no edge is within range, no vertex is, and only the interiors of faces remain.
   const bool is_inside = std::ranges::all_of(
       scratch.edges, [&](const NearEdge& e) { return e.d_sq > kClearly * range * range; });
   if (is_inside) {
@@ -489,7 +492,8 @@ void add_edge_terms(const CollisionMesh& mesh,
     const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
     if (is_beyond(corner, range)) continue;
     const ClosestPoints nearest_points = closest_points(PairKind::kEdgeEdge, corner);
-    // So are the ends then, and what they would be merged with; but for the rounding of distances.
+    // Then the ends are beyond range too, and all parts they would merge with, up to the rounding of
+    // distances.
     if (nearest_points.d_sq > kClearly * range * range) continue;
     const bool is_round = mesh.is_round_edge(c) || mesh.is_round_edge(e);
     const bool soft =

@@ -12,28 +12,28 @@
 
 namespace diffcloth::contact {
 
-/// One term of what a surface does to a point or an edge: a coefficient times m b(D).
+/// One term of the action of a surface on a point or an edge: a coefficient times m b(D).
 struct Term {
-  /// Where the nearest feature is an edge or a vertex, corners repeat ({p, e0, e1, e1}, {p, v, v, v},
-  /// {c0, c1, v, v}, {u, u, e0, e1}), so that no corner takes part that does not matter, and b is -1.
+  /// If the nearest feature is an edge or a vertex, corners repeat ({p, e0, e1, e1}, {p, v, v, v}, {c0,
+  /// c1, v, v}, {u, u, e0, e1}), so that irrelevant corners are not part of the pair, and b is -1.
   Candidate pair;
   double coefficient;
   double d_sq;  ///< [m^2]
-  /// Of an edge-edge pair, for each of its edges: 0 or 1 if D is the distance of that end, -1 if of all
-  /// of the edge. The mollifier is that of the two edges in any case.
+  /// For each edge of an edge-edge pair: 0 or 1 if D is the distance of that end, -1 if D is the
+  /// distance of the whole edge. The mollifier always refers to the two edges.
   std::array<std::int8_t, 2> ends = {-1, -1};
 };
 
-/// Lists that the functions below fill and leave behind, to be reused without allocation.
+/// Scratch lists of the functions below, reused to avoid allocation.
 struct MergeScratch {
   struct NearEdge {
     Index edge;
-    Index vertex;  ///< The end that is nearest, -1 inside the edge.
+    Index vertex;  ///< The nearest end, or -1 inside the edge.
     double d_sq;
   };
-  /// A share of a feature in the sum, before shares of one feature merge.
+  /// Contribution of a feature to the sum, before contributions of one feature merge.
   struct Part {
-    std::int8_t kind;  ///< with id and ends, tells features apart
+    std::int8_t kind;  ///< identifies the feature, with id and ends
     std::array<std::int8_t, 2> ends;
     Index id;
     double coefficient;
@@ -45,11 +45,11 @@ struct MergeScratch {
   std::vector<Part> parts;
 };
 
-/// Terms of a point against a surface, those with the same nearest feature merged and those with
-/// coefficient zero dropped: see FeatureWeights.
+/// Terms of a point against a surface. Terms with the same nearest feature are merged, and terms with
+/// coefficient zero are dropped: see FeatureWeights.
 ///
-/// @param features  those of the surface that the point sees
-/// @param group     the candidates of one point and one surface
+/// @param features  features of the surface that act on the point
+/// @param group     candidates of one point and one surface
 /// @param range     terms of a larger distance are left out [m]
 /// @param out       appended to, in the order of the features
 void add_point_terms(const CollisionMesh& mesh,
@@ -65,12 +65,12 @@ void add_point_terms(const CollisionMesh& mesh,
 ///
 ///   w_ce m(c, e) [b(D(c, e)) - 1/2 sum over the ends v of e of gamma_ev b(D(c, v))],
 ///
-/// so that an edge that is cut into pieces acts as the whole does: pieces that continue each other
-/// meet in a vertex, which each takes half of. Terms at one vertex that are not mollified merge. If c is
-/// an edge of a body too, b(D(c, .)) is likewise b(D(c, .)) - 1/2 sum over its ends u of
-/// gamma_cu b(D(u, .)).
+/// so that an edge that is cut into pieces acts as one: pieces that continue each other meet in a
+/// vertex, and each has half of it. Terms at one vertex that are not mollified merge. If c is an edge of
+/// a body too, b(D(c, .)) is likewise replaced by b(D(c, .)) - 1/2 sum over its ends u of gamma_cu
+/// b(D(u, .)).
 ///
-/// @param group           the candidates of one edge and one body
+/// @param group           candidates of one edge and one body
 /// @param edge_length_sq  [edges] of the rest shapes [m^2], for the mollifier
 void add_edge_terms(const CollisionMesh& mesh,
                     const FeatureWeights& weights,
@@ -83,8 +83,8 @@ void add_edge_terms(const CollisionMesh& mesh,
                     std::vector<Term>& out);
 
 /// Merge the terms that begin with an end of an edge, {u, u, ...}: edges that continue each other share
-/// it, and each is a group of its own. They come last then, in the order of their corners; those that
-/// cancel are dropped.
+/// the end, but are different groups. The merged terms are moved to the end, in the order of their
+/// corners; terms that cancel are dropped.
 void merge_shared_ends(std::vector<Term>& terms);
 
 }  // namespace diffcloth::contact

@@ -16,7 +16,7 @@ namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
-/// One cloth of a mesh by itself, in contact with itself; vertices keep their order.
+/// One cloth of a mesh with self-contact; vertices keep their order.
 struct Cloth {
   CollisionMesh mesh;
   std::vector<double> x;
@@ -52,7 +52,7 @@ double diameter_bound(const Cloth& cloth) {
   return std::numbers::sqrt3 * (*hi - *lo);
 }
 
-/// Grow the search radius until it finds a pair; the distance of that pair is then the radius that
+/// Increase the search radius until a pair is found; the distance of that pair, as the next radius,
 /// cannot miss the smallest.
 double smallest_distance(const Cloth& cloth) {
   if (cloth.mesh.edges.empty()) return kInfinity;

@@ -7,7 +7,7 @@
 
 namespace diffcloth::contact {
 
-/// What a contact pair consists of.
+/// Primitives of a contact pair.
 enum class PairKind : std::uint8_t { kPointTriangle, kEdgeEdge };
 
 /// Corners of a pair: point, t0, t1, t2; or a0, a1, b0, b1.

@@ -7,7 +7,7 @@
 
 namespace diffcloth::contact {
 
-/// Where the edges begin among sorted pairs.
+/// Index of the first edge-edge pair among sorted pairs.
 std::ptrdiff_t first_of_edges(const std::vector<Candidate>& pairs);
 
 /// Squared distances of sorted pairs at x, many at once [m^2].

@@ -14,7 +14,7 @@ inline std::pair<Index, Index> surfaces(const ContactModel& model, const Contact
   return std::minmax(owner[contact.pair.vertices[0]], owner[contact.pair.vertices[3]]);
 }
 
-/// Call visit(pair, contacts of it) for every pair of surfaces, in the order of the contacts.
+/// Call visit(pair, its contacts) for every pair of surfaces; contacts of a pair keep their order.
 template <class Visit>
 void for_each_pair(const ContactModel& model, const std::vector<Contact>& contacts, Visit&& visit) {
   const auto of = [&](const Contact& c) { return surfaces(model, c); };

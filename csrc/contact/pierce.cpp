@@ -13,7 +13,7 @@ namespace {
 /// Relative error of the determinant of rounded differences, [Shewchuk 1997], rounded up.
 constexpr double kOrientationError = 1e-15;
 
-/// An unevaluated sum of doubles that do not overlap, smallest first: an exact number.
+/// Exact number: an unevaluated sum of doubles that do not overlap, smallest first.
 class Expansion {
  public:
   void add(double b) {
@@ -30,7 +30,7 @@ class Expansion {
     count_ = kept;
   }
 
-  /// Add sign * a * b * c: with fused multiply-add every product splits into value and error.
+  /// Add sign * a * b * c: fused multiply-add splits every product into value and error.
   void add_product(double sign, double a, double b, double c) {
     const double ab = a * b;
     if (ab == 0 || c == 0) return;
@@ -82,7 +82,7 @@ int exact_orientation(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d
   return determinant.sign();
 }
 
-/// The sign where rounded arithmetic is certain of it, else 0.
+/// Sign of the determinant if rounded arithmetic determines it, else 0.
 int quick_orientation(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d) {
   const Vec3 u = b - a;
   const Vec3 v = c - a;
@@ -97,7 +97,7 @@ int quick_orientation(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d
   return 0;
 }
 
-/// Whether a plane across n certainly separates the edge and the triangle.
+/// True if a plane with normal n certainly separates the edge and the triangle.
 bool separates(const Vec3& n, const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t) {
   for (const Vec3& p : e) {
     for (const Vec3& q : t) {
@@ -109,8 +109,9 @@ bool separates(const Vec3& n, const std::array<Vec3, 2>& e, const std::array<Vec
   return true;
 }
 
-/// Whether some plane certainly does: mostly the one across the vector between their middles does, else
-/// the one across the shortest of the vectors between their points and edges.
+/// True if a plane certainly separates the edge and the triangle. Two are tried: normal to the vector
+/// between their centroids, which mostly suffices, then normal to the shortest vector between their
+/// points and edges.
 bool certainly_apart(const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t) {
   if (separates(3.0 * (e[0] + e[1]) - 2.0 * (t[0] + t[1] + t[2]), e, t)) return true;
   Vec3 n = separation(PairKind::kPointTriangle, {e[0], t[0], t[1], t[2]});
@@ -135,8 +136,8 @@ bool pierces(const Vec3& e0, const Vec3& e1, const Vec3& t0, const Vec3& t1, con
   const int above = quick_orientation(t0, t1, t2, e0);
   const int below = quick_orientation(t0, t1, t2, e1);
   if (above * below > 0) return false;
-  // Nearly coplanar pairs are common (a flat sheet) and mostly far apart: exact signs only for
-  // those that no plane separates.
+  // Nearly coplanar pairs are common (a flat sheet) and mostly far apart: exact signs are computed only
+  // for pairs that no plane separates.
   if ((above == 0 || below == 0) && certainly_apart({e0, e1}, {t0, t1, t2})) return false;
 
   const int side_0 = orientation(t0, t1, t2, e0);

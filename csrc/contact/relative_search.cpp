@@ -9,7 +9,7 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Pairs of leaves between two looks at the time.
+/// Number of pairs of leaves between two checkpoints.
 constexpr std::size_t kLeavesAtOnce = 256;
 
 void include(Box& box, const double* p) {
@@ -19,7 +19,7 @@ void include(Box& box, const double* p) {
   }
 }
 
-/// Give every node what its leaf holds, or its two children together.
+/// Compute the part of every node: of a leaf from its items, of an inner node from its children.
 template <class Parts, class OfLeaf, class United>
 void fit_nodes(const BoxTree& tree, Parts& parts, OfLeaf&& of_leaf, United&& unite) {
   parts.resize(tree.nodes().size());
@@ -33,7 +33,7 @@ void fit_nodes(const BoxTree& tree, Parts& parts, OfLeaf&& of_leaf, United&& uni
   }
 }
 
-/// Call something with the trees of a surface, their boxes, and the corners of their items.
+/// Call visit(tree, parts, corners of an item) for the three trees of a surface.
 template <class Surface, class Visit>
 void for_each_tree(const BroadPhase& broad_phase, Index s, Surface& surface, Visit&& visit) {
   const CollisionMesh& mesh = broad_phase.mesh();
@@ -43,13 +43,13 @@ void for_each_tree(const BroadPhase& broad_phase, Index s, Surface& surface, Vis
   visit(trees.faces, surface.faces, [&](Index f) { return mesh.faces[f]; });
 }
 
-/// Where an item is at both ends of a motion.
+/// Boxes of an item at both ends of a motion.
 struct Swept {
   Box t0 = kEmptyBox;
   Box t1 = kEmptyBox;
 };
 
-/// Those of the items of a leaf.
+/// Boxes of the items of a leaf at both ends of the motion.
 template <class Corners>
 std::array<Swept, kBoxGroup> sweep(std::span<const Index> items,
                                    Corners&& corners,
@@ -64,7 +64,7 @@ std::array<Swept, kBoxGroup> sweep(std::span<const Index> items,
   return result;
 }
 
-/// Whether two items come within range of each other as far as their boxes tell, as seen from either.
+/// True unless the boxes of two items, swept in relative motion, stay farther apart than `range`.
 bool may_meet(const Swept& a, const Swept& b, double range) {
   double sum = 0.0;
   for (int k = 0; k < 3; ++k) {
@@ -97,7 +97,8 @@ void visit_items(std::span<const Index> a,
 }  // namespace
 
 double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1) {
-  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
+  const int first =
+      pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second primitive
   double result = 0.0;
   for (const double* u : {u_t0, u_t1}) {
     const auto& v = pair.vertices;
@@ -109,8 +110,8 @@ double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1
   return result;
 }
 
-/// Whether anything in two parts has moved by more than `least` against each other, and can come within
-/// range on the motion. Branch-free, as the outcome is as good as random.
+/// True if anything in two parts may have moved by more than `least` against each other, and may come
+/// within range on the motion. Branch-free, as the outcome is unpredictable.
 bool RelativeSearch::may_meet(const Part& a, const Part& b, double range, double least) {
   double moved_t0 = 0.0;
   double moved_t1 = 0.0;

@@ -12,7 +12,7 @@ namespace diffcloth::contact {
 /// Pairs that may come near each other on a motion.
 struct Found {
   std::vector<Candidate> pairs;
-  std::vector<double> apart;  ///< at every time of the motion their distance is at least this [m]
+  std::vector<double> apart;  ///< lower bound of the distance at every time of the motion [m]
 
   void clear() {
     pairs.clear();
@@ -28,55 +28,56 @@ struct Found {
   }
 };
 
-/// Square of how much the two primitives of a pair can have come closer in two displacements, at most:
-/// the largest change of a vector between their corners. That between any two of their points is a
-/// mean of those.
+/// Square of an upper bound of the approach of the two primitives of a pair in two displacements: the
+/// largest change of a vector between their corners. The change of a vector between any two other points
+/// is a mean of these.
 double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1);
 
-/// Search for pairs by how their parts have moved against each other since a reference.
+/// Search for pairs by the relative displacement of their parts since a reference.
 ///
-/// What lies side by side moves nearly alike, however far it goes: it is left out with the boxes around
-/// it, by the boxes of positions at the reference and those of displacements since then.
+/// Adjacent parts move nearly alike, however far they move: the search prunes them in the hierarchy by
+/// boxes of reference positions and boxes of displacements since the reference.
 class RelativeSearch {
  public:
-  /// @param checkpoint  passed now and then by find(), which it may end by an exception; may be null
+  /// @param checkpoint  polled regularly by find(), which it may end by an exception; may be null
   explicit RelativeSearch(const BroadPhase& broad_phase, const Checkpoint* checkpoint)
       : broad_phase_(&broad_phase), checkpoint_(checkpoint) {}
 
-  /// Begin at a configuration.
+  /// Set the reference configuration.
   void start(const double* reference);
 
-  /// What is looked for on a straight motion.
+  /// Input of one search along a straight motion.
   struct Wanted {
-    const double* reference;  ///< of start()
+    const double* reference;  ///< positions passed to start()
     const double* x_t0;
     const double* x_t1;
     const double* u_t0;             ///< displacements since the reference, at x_t0
     const double* u_t1;             ///< and at x_t1
     std::span<const double> reach;  ///< [surfaces] [m]
-    double least;                   ///< approach since the reference up to which none is wanted [m]
-    double rounding;                ///< of a distance [m]
+    double least;                   ///< approach since the reference of unwanted pairs, at most [m]
+    double rounding;                ///< bound of the rounding error of a distance [m]
   };
 
   /// Append all pairs of which two corners have moved by more than `least` against each other, and that
-  /// come within the sum of the two reaches at any time of the motion; in any order, and some others.
+  /// come within the sum of the two reaches at any time of the motion; unordered, with some further
+  /// pairs.
   ///
-  /// @return how many pairs of leaves were looked at
+  /// @return number of pairs of leaves that were visited
   std::size_t find(const Wanted& wanted, BroadPhase::Scratch& scratch, Found& out);
 
  private:
-  /// Boxes around a part: its positions at the reference, and its displacements at both ends.
+  /// Boxes of a part: reference positions, and displacements at both ends.
   struct Part {
     Box place = kEmptyBox;
     Box u_t0 = kEmptyBox;
     Box u_t1 = kEmptyBox;
   };
-  using Parts = std::vector<Part>;  // of the nodes of a tree
+  using Parts = std::vector<Part>;  // one per node of a tree
   struct Surface {
     Parts vertices;
     Parts edges;
     Parts faces;
-    bool moved = true;  // displacements are not all zero
+    bool moved = true;  // true if displacements are not all zero
   };
 
   static bool may_meet(const Part& a, const Part& b, double range, double least);

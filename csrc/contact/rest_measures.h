@@ -7,7 +7,8 @@
 
 namespace diffcloth::contact {
 
-/// Rest quantities that weigh contacts. Those of the cloths carry gradients; a body's are constant.
+/// Rest quantities that weight contacts. Measures of cloths carry gradients; measures of bodies are
+/// constant.
 struct RestMeasures {
   std::vector<double> vertex_area;     ///< [vertices] a third of the adjacent faces [m^2]
   std::vector<double> edge_area;       ///< [edges] a third of the adjacent faces [m^2]
@@ -19,9 +20,9 @@ struct RestMeasures {
   static RestMeasures zero(const CollisionMesh& mesh);
 };
 
-/// Measures of a mesh at rest. The area of a round body is shared by the ends of its skeleton.
+/// Measures of a mesh at rest. The area of a round body is divided between the ends of its skeleton.
 ///
-/// @param X  rest positions, 3 * vertex_count; each surface may be in a frame of its own
+/// @param X  rest positions, 3 * vertex_count; each surface may be in its own frame
 RestMeasures measure(const CollisionMesh& mesh, const double* X);
 
 }  // namespace diffcloth::contact

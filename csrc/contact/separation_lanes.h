@@ -7,12 +7,12 @@
 
 namespace diffcloth::contact {
 
-/// Squared distances of many pairs of one kind, several at once [m^2]: those of distance_sq(), but for rounding,
-/// and the same on every level, whatever pairs are beside them.
+/// Squared distances of many pairs of one kind, several at once [m^2]: equal to distance_sq() up to
+/// rounding, and bitwise equal on every level, regardless of adjacent pairs.
 ///
-/// @param edges    two edges, or a point and a triangle
-/// @param corners  where the four vertices of the first pair are; those of the next follow `stride` later
-/// @param count    of the pairs
+/// @param edges    true: two edges; false: a point and a triangle
+/// @param corners  the four vertices of the first pair; the next pair follows at `stride`
+/// @param count    number of pairs
 using SquaredDistances = void (*)(bool edges,
                                   const double* x,
                                   const std::int32_t* corners,
@@ -20,7 +20,7 @@ using SquaredDistances = void (*)(bool edges,
                                   std::ptrdiff_t count,
                                   double* d_sq);
 
-/// @throws std::invalid_argument  where this processor or build has none of that level
+/// @throws std::invalid_argument  if this processor or build does not support the level
 SquaredDistances squared_distances(linalg::KernelLevel level);
 
 }  // namespace diffcloth::contact

@@ -1,6 +1,7 @@
-// The distances of SquaredDistances, written once over packs of `kPack` doubles. Each pack is one number of as many
-// pairs. Where distance/separation.cpp branches, all results are computed here and one is selected. Everything is in
-// an anonymous namespace, for the reason given in linalg/dense_kernels_impl.h.
+// Kernel of SquaredDistances, written once over packs of `kPack` doubles. A pack holds one number of
+// each of kPack pairs. In place of the branches of distance/separation.cpp, all results are computed
+// here and one is selected. Everything is in an anonymous namespace, for the reason given in
+// linalg/dense_kernels_impl.h.
 
 #pragma once
 
@@ -49,7 +50,7 @@ DIFFCLOTH_INLINE Pack clamped_ratio(const Pack& numerator, const Pack& denominat
   return denominator > 0.0 ? ratio : Pack{};
 }
 
-/// From the segment that starts at the origin with direction e to the point w.
+/// Squared distance of the point w from the segment that starts at the origin with direction e.
 DIFFCLOTH_INLINE Pack from_segment(const Vectors& w, const Vectors& e) {
   return square(less(w, clamped_ratio(dot(w, e), dot(e, e)), e));
 }
@@ -63,7 +64,7 @@ DIFFCLOTH_INLINE Pack from_triangle(const Vectors (&x)[4]) {
   Pack b0 = dot(cross(w, e1), n) / n_sq;
   Pack b1 = dot(cross(e0, w), n) / n_sq;
   const Mask is_sliver = n_sq < kSliver * dot(e0, e0) * dot(e1, e1);
-  // In slivers b0 and b1 carry an error of rounding / sin(angle): improved with what is left of w.
+  // In slivers b0 and b1 have an error of rounding / sin(angle): one step of iterative refinement.
   const Vectors rest = less(less(w, b0, e0), b1, e1);
   b0 = is_sliver ? b0 + dot(cross(rest, e1), n) / n_sq : b0;
   b1 = is_sliver ? b1 + dot(cross(e0, rest), n) / n_sq : b1;
@@ -112,7 +113,7 @@ void find_squared_distances(bool edges,
     const std::ptrdiff_t left = count - first;
     alignas(8 * kPack) double at[4][3][kPack];
     for (int l = 0; l < kPack; ++l) {
-      // The last pair stands in for those that do not exist.
+      // Lanes beyond the last pair repeat it.
       const std::int32_t* const pair = corners + stride * (first + (l < left ? l : left - 1));
       for (int i = 0; i < 4; ++i) {
         const double* const from = x + 3 * static_cast<std::ptrdiff_t>(pair[i]);

@@ -20,18 +20,18 @@ double angle_between(const Vec3& a, const Vec3& b) {
   return std::atan2(a.cross(b).norm(), a.dot(b));
 }
 
-/// Whether a face runs through its side from the edge's lower to its higher vertex.
+/// True if a face traverses an edge from its lower to its higher vertex.
 bool runs_up(const CollisionMesh& mesh, Index f, Index e) {
   const auto& sides = mesh.face_edges[f];
   const auto side = std::find(sides.begin(), sides.end(), e) - sides.begin();
   return mesh.faces[f][side] == mesh.edges[e][0];
 }
 
-/// What the angles of a body's features are measured with.
+/// Quantities from which the angles of a body's features are computed.
 struct Faces {
-  std::vector<Vec3> normal;       ///< [faces] unit, or zero of a face without area
-  std::vector<Index> edge_count;  ///< [edges] faces of an edge
-  std::vector<char> solid;        ///< [faces] whether it is of a solid part
+  std::vector<Vec3> normal;       ///< [faces] unit, or zero for a face without area
+  std::vector<Index> edge_count;  ///< [edges] number of faces at the edge
+  std::vector<char> solid;        ///< [faces] true if the face belongs to a solid part
 };
 
 std::vector<char> find_solid(const CollisionMesh& mesh,
@@ -81,7 +81,7 @@ Faces describe(const CollisionMesh& mesh, const double* X) {
   return faces;
 }
 
-/// Exterior dihedral angle with its sign, as far as it is known.
+/// Exterior dihedral angle, with its sign if the part is solid.
 double dihedral(const CollisionMesh& mesh, const double* X, const Faces& faces, Index e) {
   if (faces.edge_count[e] != 2) return std::numbers::pi;
   const auto& [f, g] = mesh.edge_faces[e];
@@ -95,8 +95,8 @@ double dihedral(const CollisionMesh& mesh, const double* X, const Faces& faces, 
   return (turn.dot(along) > 0.0) == runs_up(mesh, f, e) ? angle : -angle;
 }
 
-/// Perimeter of the smallest convex cone around unit vectors that all lean towards a pole: the sum
-/// of the angles between its neighboring extreme rays.
+/// Perimeter of the smallest convex cone around unit vectors within 90 degrees of a pole: the sum of the
+/// angles between its neighboring extreme rays.
 double cone_perimeter(const std::vector<Vec3>& directions, const Vec3& pole) {
   const Vec3 a = pole.unitOrthogonal();
   const Vec3 b = pole.cross(a);
@@ -133,7 +133,7 @@ double cone_perimeter(const std::vector<Vec3>& directions, const Vec3& pole) {
   return perimeter;
 }
 
-/// A unit vector that all directions lean towards, if there is one that is not too hard to find.
+/// Unit vector within 90 degrees of all directions; none if the search does not find one.
 std::optional<Vec3> find_pole(const std::vector<Vec3>& directions, const Vec3& guess) {
   constexpr int kCorrections = 100;
   Vec3 pole = guess;
@@ -154,19 +154,19 @@ std::optional<Vec3> find_pole(const std::vector<Vec3>& directions, const Vec3& g
 /// Edges and faces around a vertex.
 struct Star {
   std::vector<Vec3> directions;      ///< unit vectors along its edges
-  Vec3 normal = Vec3::Zero();        ///< sum of the unit normals of its faces, by their angle
+  Vec3 normal = Vec3::Zero();        ///< sum of its faces' unit normals, weighted by angle
   double angle = 0.0;                ///< sum of the angles of its faces
   double lowest = std::numbers::pi;  ///< smallest dihedral angle of its edges
   bool solid = true;
 };
 
-/// Solid angle of the directions that point away from everything around a vertex.
+/// Solid angle of the directions that point away from all edges at a vertex.
 double normal_cone(const Star& star) {
   constexpr double kFullTurn = 2.0 * std::numbers::pi;
   if (star.directions.empty()) return 0.0;
   double omega = 0.0;
   if (star.solid && star.lowest >= 0.0) {
-    omega = kFullTurn - star.angle;  // convex: the angle that is missing
+    omega = kFullTurn - star.angle;  // convex: the angle deficit
   } else {
     Vec3 sum = Vec3::Zero();
     for (const Vec3& d : star.directions) sum += d;

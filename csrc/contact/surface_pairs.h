@@ -8,7 +8,7 @@
 
 namespace diffcloth::contact {
 
-/// Which pairs of surfaces may touch: symmetric, a surface with itself included.
+/// Pairs of surfaces that may touch: symmetric, including a surface with itself.
 class SurfacePairs {
  public:
   SurfacePairs() = default;
@@ -27,12 +27,12 @@ class SurfacePairs {
   std::vector<char> contains_;  // [surfaces^2]
 };
 
-/// What makes surfaces touch, of cloths (0 .. cloth_count - 1) and bodies.
+/// Rules that determine which surfaces may touch: cloths (0 .. cloth_count - 1), then bodies.
 struct TouchRules {
   Index surface_count;
   Index cloth_count;
-  bool self_contact;                              ///< Whether a cloth touches itself.
-  std::span<const char> body_dynamic;             ///< [bodies] moved by dynamics; empty: none is.
+  bool self_contact;                              ///< True if a cloth touches itself.
+  std::span<const char> body_dynamic;             ///< [bodies] true if dynamic; empty: none is.
   std::span<const std::array<Index, 2>> ignored;  ///< Pairs of surfaces that never touch.
 };
 

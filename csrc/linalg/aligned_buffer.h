@@ -7,7 +7,7 @@
 
 namespace diffcloth::linalg {
 
-/// Numbers at an address that is a multiple of a cache line, not initialized.
+/// Uninitialized numbers, aligned to a cache line.
 template <class T>
 class AlignedBuffer {
  public:
@@ -15,7 +15,8 @@ class AlignedBuffer {
   explicit AlignedBuffer(std::size_t size)
       : data_(size == 0 ? nullptr : static_cast<T*>(take_recycled(size * sizeof(T))), {size, {}}) {}
 
-  /// In the room of a step, where what is large finds the memory of what was there before.
+  /// Allocate from the room of a step, in which large buffers reuse memory that was freed in the same
+  /// step.
   AlignedBuffer(std::size_t size, const std::shared_ptr<SpareRoom>& room)
       : data_(size == 0 ? nullptr : static_cast<T*>(room->take(size * sizeof(T))), {size, room}) {}
 
@@ -27,7 +28,7 @@ class AlignedBuffer {
  private:
   struct GiveBack {
     std::size_t size;
-    std::weak_ptr<SpareRoom> room;  // of a step that may have ended
+    std::weak_ptr<SpareRoom> room;  // of a step, which may have ended
     void operator()(T* p) const {
       if (const std::shared_ptr<SpareRoom> open = room.lock()) {
         open->give_back(p, size * sizeof(T));

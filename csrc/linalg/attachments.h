@@ -6,10 +6,11 @@
 
 namespace diffcloth::linalg {
 
-/// How points that have no rows of their own move with rows of a matrix:  dx_p = sum of J dz_row.
+/// Motion of points without rows of their own, as a function of rows of a matrix:  dx_p = sum of J
+/// dz_row.
 ///
-/// Points are numbered from `first` on, and those before are rows themselves. The rows of a point are
-/// a constant; the Jacobians belong to one configuration.
+/// Points from number `first` on are attached; points before `first` are rows themselves. The rows of a
+/// point are constant; the Jacobians belong to one configuration.
 struct Attachments {
   struct Entry {
     Index row;
@@ -17,7 +18,7 @@ struct Attachments {
   };
 
   Index first = 0;
-  std::vector<Index> start{0};  ///< of the entries of point first + k; [points + 1]
+  std::vector<Index> start{0};  ///< [points + 1] first entry of point first + k
   std::vector<Entry> entries;
 
   bool empty() const { return entries.empty(); }

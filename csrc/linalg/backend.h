@@ -17,7 +17,7 @@ namespace diffcloth::linalg {
 class CholeskyWorkspace;
 struct CholeskySeconds;
 
-/// Values of a factorization: what CholeskyFactor stands before.
+/// Values of a factorization; implementation behind CholeskyFactor.
 class FactorBackend {
  public:
   FactorBackend() = default;
@@ -35,7 +35,7 @@ class FactorBackend {
   virtual std::size_t bytes() const = 0;
 };
 
-/// Structure of a factorization: what CholeskyAnalysis stands before. It outlives its factors.
+/// Structure of a factorization; implementation behind CholeskyAnalysis. Must outlive its factors.
 class AnalysisBackend {
  public:
   AnalysisBackend() = default;
@@ -43,8 +43,8 @@ class AnalysisBackend {
   AnalysisBackend(const AnalysisBackend&) = delete;
   AnalysisBackend& operator=(const AnalysisBackend&) = delete;
 
-  /// @param precision  that is asked for; a backend may have doubles only
-  /// @param room       for what is large
+  /// @param precision  requested precision; a backend may support doubles only
+  /// @param room       memory for large arrays
   virtual std::unique_ptr<FactorBackend> make_factor(
       Precision precision, const std::shared_ptr<SpareRoom>& room) const = 0;
   virtual Index dimension() const = 0;

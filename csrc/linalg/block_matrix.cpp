@@ -9,7 +9,7 @@
 namespace diffcloth::linalg {
 
 Couplings beyond(const BlockPattern& base, const Couplings& pairs) {
-  // Counted by column; the few rows of each are then sorted by themselves.
+  // Bucket sort by column; the few rows of each column are then sorted.
   const auto size = static_cast<std::size_t>(base.size());
   std::vector<Index> start(size + 1, 0);
   for (const auto& pair : pairs) ++start[pair.second + 1];
@@ -17,10 +17,10 @@ Couplings beyond(const BlockPattern& base, const Couplings& pairs) {
   std::vector<Index> row(pairs.size());
   for (const auto& pair : pairs) row[start[pair.second]++] = pair.first;
   Couplings result;
-  std::vector<Index> known_in(size, -1);  // the last column that has this row
+  std::vector<Index> known_in(size, -1);  // last column that contains this row
   Index first = 0;
   for (Index column = 0; column < base.size(); ++column) {
-    const Index last = start[column];  // moved on to the end of its run by the loop above
+    const Index last = start[column];  // advanced to the end of its run by the loop above
     if (first == last) continue;
     for (Index k = base.column_start()[column]; k < base.column_start()[column + 1]; ++k) {
       known_in[base.row()[k]] = column;
@@ -103,7 +103,7 @@ void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& 
     }
   }
   for (const Motion& s : motions_) {
-    // Products of this size are faster coefficient by coefficient.
+    // Lazy products are faster at this size.
     Eigen::Matrix<double, 12, 3> hg;
     if (s.point >= 0) {
       hg = h.middleCols<3>(3 * s.point);
@@ -188,7 +188,7 @@ void add_one_product(const BlockPattern& pattern,
   }
 }
 
-/// For at most kMaxVectors.
+/// For at most kMaxVectors vectors.
 void add_many_products(const BlockPattern& pattern,
                        const double* blocks,
                        std::span<const double* const> x,

@@ -17,10 +17,10 @@ namespace diffcloth::linalg {
 /// Pairs (row, column) of a lower triangle, row > column.
 using Couplings = std::vector<std::pair<Index, Index>>;
 
-/// The couplings that a pattern lacks, by (column, row), each once.
+/// Couplings that are not in the base pattern, by (column, row), each once.
 Couplings beyond(const BlockPattern& base, const Couplings& pairs);
 
-/// A base pattern enlarged by further couplings, and where the slots of the base went.
+/// A base pattern enlarged by further couplings, with the new slots of the base's blocks.
 struct MergedPattern {
   BlockPattern pattern;
   std::vector<Index> slot_of_base;  ///< [base.block_count()]
@@ -29,7 +29,7 @@ struct MergedPattern {
 /// Enlarge a pattern by sorted couplings.
 MergedPattern merge(const BlockPattern& base, const Couplings& pairs);
 
-/// A symmetric matrix on a merged pattern, by its lower blocks.
+/// Symmetric matrix on a merged pattern, stored by its lower blocks.
 class BlockValues {
  public:
   const BlockPattern& pattern() const { return merged_->pattern; }
@@ -39,10 +39,10 @@ class BlockValues {
   /// y += A x.
   void add_product(const double* x, double* y) const;
 
-  /// The same for several vectors, each with the bits that it has alone.
+  /// y_k += A x_k for several vectors, each with the same bits as alone.
   void add_products(std::span<const double* const> x, std::span<double* const> y) const;
 
-  /// Memory of the values, without that of the pattern.
+  /// Memory of the values, without the pattern.
   std::size_t bytes() const { return blocks_.capacity() * sizeof(double); }
 
  protected:
@@ -54,21 +54,20 @@ class BlockValues {
   std::vector<double, RecyclingAllocator<double>> blocks_;
 };
 
-/// Such a matrix while it is assembled, whose rows are the cloth's vertices and, behind them, nodes of
-/// coordinates.
+/// Matrix under assembly, whose rows are the cloth's vertices followed by nodes of coordinates.
 ///
-/// Potentials with elements that never change add to the base pattern, whose slots they know; the
-/// others add blocks by their points, of which those without rows may be attached to some. Rows of
-/// fixed points exist in the base pattern only.
+/// Potentials with constant elements add to the slots of the base pattern, which they store. Other
+/// potentials add blocks by point; points without rows may be attached to rows. Rows of fixed points
+/// exist in the base pattern only.
 class BlockMatrix : public BlockValues {
  public:
-  /// @param fixed        [pattern size] rows that further couplings leave out
-  /// @param attachments  of the points that are no rows; null where every point is one
+  /// @param fixed        [pattern size] rows without further couplings
+  /// @param attachments  of the points without rows; null if every point is a row
   BlockMatrix(std::shared_ptr<const MergedPattern> merged,
               const std::vector<char>& fixed,
               const Attachments* attachments = nullptr);
 
-  /// Where the slots of the base pattern lie in blocks().
+  /// Slots of the base pattern's blocks in blocks().
   const std::vector<Index>& slot_of_base() const { return merged_->slot_of_base; }
 
   /// Add value times I to the diagonal block of vertex i.
@@ -93,10 +92,10 @@ class BlockMatrix : public BlockValues {
                      9 * static_cast<std::ptrdiff_t>(merged_->pattern.slot(i, j))) += block;
   }
 
-  /// Add the matrix of a few points, each of them a row or none, without the rows that are left out.
+  /// Add the matrix of a few points, each of which may be a row; rows of fixed points are left out.
   ///
-  /// @param block  (p, q) -> its 3x3 block; asked for those alone that are added, of bodies' points often
-  ///               one of sixteen
+  /// @param block  (p, q) -> its 3x3 block; called only for blocks that are added: for points of bodies
+  /// often one of sixteen
   template <class Block>
   void add_rows(std::span<const Index> points, Block&& block) {
     const auto count = static_cast<int>(points.size());
@@ -110,7 +109,7 @@ class BlockMatrix : public BlockValues {
     }
   }
 
-  /// The same of a matrix by what it is made of.
+  /// Add a matrix given by its factors; rows as in add_rows().
   void add_terms(std::span<const Index> points, const StencilTerms& of);
 
   /// Add the 12x12 matrix of four points, some of which may be attached.
@@ -128,13 +127,13 @@ class BlockMatrix : public BlockValues {
                       std::span<const Mat3> jacobians,
                       const Mat3& core);
 
-  /// Whether one of some points is attached to rows.
+  /// True if any of the points is attached to rows.
   bool any_attached(std::span<const Index> points) const {
     return attachments_ != nullptr &&
            std::ranges::any_of(points, [&](Index v) { return is_attached(v); });
   }
 
-  /// Whether one of some points is a row here, or attached to some.
+  /// True if any of the points is a row here, or attached to rows.
   bool has_any(std::span<const Index> points) const {
     return std::ranges::any_of(points, [&](Index v) { return has(v) || is_attached(v); });
   }
@@ -143,7 +142,7 @@ class BlockMatrix : public BlockValues {
   void blend(const BlockMatrix& other, double s);
 
  private:
-  /// Whether a point is a row here that is not fixed.
+  /// True if a point is a row here that is not fixed.
   bool has(Index point) const {
     const Index rows = attachments_ == nullptr ? merged_->pattern.size() : attachments_->first;
     return point < rows && (*fixed_)[point] == 0;
@@ -154,17 +153,17 @@ class BlockMatrix : public BlockValues {
   }
   void add_attached(const std::array<Index, 4>& points, const Mat12& h);
 
-  /// How four points move with a row: dx = g dz, or one of them alone, where it is the row.
+  /// Motion of four points with a row: dx = g dz, or the identity for one point if it is the row.
   struct Motion {
     Index row;
-    int point;  ///< among the four; -1: see g
+    int point;  ///< index among the four; -1: see g
     Eigen::Matrix<double, 12, 3> g;
   };
 
   const std::vector<char>* fixed_;
   const Attachments* attachments_;
   std::vector<Motion> motions_;                  // scratch of add_attached
-  std::vector<std::pair<Index, Mat3>> changes_;  // scratch of add_congruence: B, row by row
+  std::vector<std::pair<Index, Mat3>> changes_;  // scratch of add_congruence: B by row
 };
 
 /// y += A x for a symmetric matrix given by its lower blocks on the pattern, and several vectors.

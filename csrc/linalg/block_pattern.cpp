@@ -38,7 +38,8 @@ BlockPattern BlockPattern::from_pairs(Index vertex_count,
 }
 
 Index BlockPattern::slot(Index i, Index j) const {
-  // The lower bound of i; which half it is in is as good as random, so that there are no branches.
+  // Binary search for the lower bound of i; branch-free, because the half that contains it is
+  // unpredictable.
   const Index* first = row_.data() + column_start_[j];
   for (Index count = column_start_[j + 1] - column_start_[j]; count > 0;) {
     const Index half = (count + 1) / 2;

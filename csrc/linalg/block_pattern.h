@@ -8,11 +8,11 @@
 
 namespace diffcloth::linalg {
 
-/// Which 3x3 blocks of a symmetric matrix over n vertices may be nonzero.
+/// Sparsity pattern of the 3x3 blocks of a symmetric matrix over n vertices.
 ///
-/// Only the lower triangle is kept (row >= column), column by column, rows ascending; every
-/// diagonal block is present. The slot of a block is its place in that order, and a matrix on the
-/// pattern is a flat array of 9 doubles a slot (column-major blocks).
+/// Only the lower triangle is stored (row >= column), column by column, rows ascending; every diagonal
+/// block is present. The slot of a block is its index in that order, and a matrix on the pattern is a
+/// flat array of 9 doubles a slot (column-major blocks).
 class BlockPattern {
  public:
   BlockPattern() = default;
@@ -38,9 +38,9 @@ class BlockPattern {
   /// Slot of block (i, j) with i >= j. The block must be in the pattern.
   Index slot(Index i, Index j) const;
 
-  /// Slots of all pairs (p, q), p >= q, of a clique, in the order (0,0), (1,0), (1,1), (2,0) ...
-  /// The block of a pair lies at (max, min) of its two vertices: it is the transpose of the
-  /// element's block (p, q) where clique[p] < clique[q].
+  /// Slots of all pairs (p, q), p >= q, of a clique, in the order (0,0), (1,0), (1,1), (2,0) ... The
+  /// block of a pair is stored at (max, min) of its two vertices: it is the transpose of the element's
+  /// block (p, q) if clique[p] < clique[q].
   std::vector<Index> slots(std::span<const Index> clique) const;
 
   friend bool operator==(const BlockPattern&, const BlockPattern&) = default;
@@ -50,11 +50,11 @@ class BlockPattern {
   std::vector<Index> row_;
 };
 
-/// Place of the lower-triangle pair (p, q), p >= q, in the order that slots() uses.
+/// Index of the lower-triangle pair (p, q), p >= q, in the order of slots().
 constexpr Index lower(Index p, Index q) { return p * (p + 1) / 2 + q; }
 
-/// Add an element's block (p, q), p >= q, to a matrix on the pattern, transposed where the
-/// vertices stand the other way round.
+/// Add an element's block (p, q), p >= q, to a matrix on the pattern, transposed if the vertices are
+/// stored in the opposite order.
 template <class Block>
 inline void add_block(double* values, Index slot, bool transposed, const Block& block) {
   Eigen::Map<Mat3> target(values + 9 * static_cast<std::ptrdiff_t>(slot));

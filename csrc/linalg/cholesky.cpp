@@ -74,7 +74,7 @@ std::string factorization_name() {
 
 void* CholeskyWorkspace::reserve_bytes(std::size_t size) {
   if (buffer_.size() < size) {
-    buffer_ = {};  // never both at once
+    buffer_ = {};  // free the old buffer first, to limit the peak
     buffer_ = AlignedBuffer<std::byte>(size);
   }
   return buffer_.data();

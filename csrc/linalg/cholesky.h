@@ -15,11 +15,11 @@
 
 namespace diffcloth::linalg {
 
-/// What factors a matrix.
+/// Implementation of the factorization.
 enum class Backend : std::uint8_t {
-  kMultifrontal,  ///< our own, without a BLAS
+  kMultifrontal,  ///< our own implementation, without a BLAS
   kEigen,         ///< Eigen's SimplicialLLT
-  kCholmod,       ///< CHOLMOD's supernodal factorization; where the build has it
+  kCholmod,       ///< CHOLMOD's supernodal factorization; optional in a build
 };
 
 const char* name(Backend backend);
@@ -27,24 +27,23 @@ const char* name(Backend backend);
 /// The backends of this build.
 const std::vector<Backend>& available_backends();
 
-/// The backend that this build was told to use (DIFFCLOTH_FACTORIZATION): our own if nothing was said.
+/// Backend chosen at build time (DIFFCLOTH_FACTORIZATION); kMultifrontal by default.
 Backend default_backend();
 
-/// What the default backend is in this process: "multifrontal (avx512)".
+/// Name of the default backend, with its kernel level: "multifrontal (avx512)".
 std::string factorization_name();
 
 class AnalysisBackend;
 class FactorBackend;
 
-/// Memory and threads that factorizations and solves need while they run. Keep one for each
-/// environment and pass it to every compute() and solve(): it grows to what the largest needs and stays
-/// so.
+/// Temporary memory and threads of factorizations and solves. Keep one for each environment and pass it
+/// to every compute() and solve(): its memory grows to the largest demand and is not released.
 class CholeskyWorkspace {
  public:
-  /// @param threads  that large ones are shared by; they do not change a bit
+  /// @param threads  threads that share large factorizations and solves; results do not depend on them
   explicit CholeskyWorkspace(int threads = 1) : team_(threads) {}
 
-  /// At least `size` numbers, of any values.
+  /// Uninitialized memory for at least `size` numbers.
   template <class Real>
   Real* reserve(std::size_t size) {
     return static_cast<Real*>(reserve_bytes(size * sizeof(Real)));
@@ -54,7 +53,7 @@ class CholeskyWorkspace {
 
   Team& team() { return team_; }
 
-  /// For factors that are made while this one lives.
+  /// Room for factors that are created during the life of this workspace.
   const std::shared_ptr<SpareRoom>& room() const { return room_; }
 
  private:
@@ -65,22 +64,22 @@ class CholeskyWorkspace {
   std::shared_ptr<SpareRoom> room_ = std::make_shared<SpareRoom>();
 };
 
-/// Where the time of multifrontal factorizations went on the caller's thread [s].
+/// Time of multifrontal factorizations by phase, on the caller's thread [s].
 struct CholeskySeconds {
   double assembly = 0.0;    ///< the matrix into panels
   double extend_add = 0.0;  ///< update matrices of children into their parents
   double dense = 0.0;       ///< columns of L and update matrices
 };
 
-/// What only tests and benchmarks choose.
+/// Options for tests and benchmarks.
 struct CholeskyOptions {
-  KernelLevel level = chosen_level();  ///< of our own kernels
+  KernelLevel level = chosen_level();  ///< for the multifrontal backend
   Ordering ordering = Ordering::kAutomatic;
 };
 
 /// Symbolic part of A = L L^T for a block pattern with some vertices left out.
 ///
-/// Everything is done on the graph of the vertices, which is nine times smaller than that of the
+/// The analysis works on the graph of the vertices, which is nine times smaller than the graph of the
 /// scalars. Immutable; shared by any number of factors and threads.
 class CholeskyAnalysis {
  public:
@@ -93,16 +92,16 @@ class CholeskyAnalysis {
   CholeskyAnalysis(const CholeskyAnalysis&) = delete;
   CholeskyAnalysis& operator=(const CholeskyAnalysis&) = delete;
 
-  /// Unknown scalars.
+  /// Number of unknown scalars.
   Index dimension() const;
 
-  /// Memory of the analysis.
+  /// Memory of the analysis [bytes].
   std::size_t bytes() const;
 
-  /// Entries of L, stored zeros included.
+  /// Number of entries of L, including stored zeros.
   std::size_t nonzeros() const;
 
-  /// Operations of one factorization.
+  /// Floating-point operations of one factorization.
   double flops() const;
 
   const AnalysisBackend& backend() const { return *backend_; }
@@ -111,16 +110,17 @@ class CholeskyAnalysis {
   std::unique_ptr<const AnalysisBackend> backend_;
 };
 
-/// A = L L^T, and not L D L^T: only the former reports an indefinite matrix.
+/// Factorization A = L L^T; in contrast to L D L^T it detects an indefinite matrix.
 ///
-/// In single precision it takes half the time and memory of one in doubles, and solves to the share of
-/// rounding that the condition of the matrix makes of 6e-8: as a preconditioner it is as good. Rows and
-/// columns are scaled by powers of two, so that units change nothing, and numbers below 1e-38 of
-/// those of the diagonal are zero.
+/// A factor in single precision takes half the time and memory of one in doubles, and its solutions have
+/// a relative error of 6e-8 times the condition number: as a preconditioner it is as good. Rows and
+/// columns are scaled by powers of two, so that units do not matter, and numbers below 1e-38 relative to
+/// the diagonal are zero.
 class CholeskyFactor {
  public:
-  /// @param precision  that is asked for; backends other than ours have doubles only
-  /// @param room       for what is large, of the workspace that is used with it; else its own
+  /// @param precision  requested precision; only kMultifrontal supports kSingle
+  /// @param room       memory for large arrays, of the workspace used with the factor; else a room of
+  /// its own
   explicit CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis,
                           Precision precision = Precision::kDouble,
                           const std::shared_ptr<SpareRoom>& room = std::make_shared<SpareRoom>());
@@ -128,37 +128,37 @@ class CholeskyFactor {
   CholeskyFactor(const CholeskyFactor&) = delete;
   CholeskyFactor& operator=(const CholeskyFactor&) = delete;
 
-  /// Factor the matrix with these block values, of whose diagonal blocks the lower triangles count.
-  /// It ends at once where that turns out not to be positive definite, or unclear; the factor must
-  /// then not be used before another compute() has succeeded.
+  /// Factor the matrix with these block values; of diagonal blocks only the lower triangles are read.
+  /// Returns as soon as the matrix is found to be not positive definite, or unclear; the factor must
+  /// then not be used until another compute() has succeeded.
   ///
-  /// @param seconds  if given, times are added to it; backends other than ours leave it alone
+  /// @param seconds  if given, times are added; only kMultifrontal does so
   [[nodiscard]] Verdict compute(const double* blocks,
                                 CholeskyWorkspace& workspace,
                                 CholeskySeconds* seconds = nullptr);
 
-  /// The same with memory of its own for this call.
+  /// Factor with a temporary workspace.
   [[nodiscard]] Verdict compute(const double* blocks);
 
-  /// x = A^-1 b over 3 * vertex_count coordinates; rows of vertices left out stay as they are. May
-  /// be called from any number of threads at once, each with its workspace.
+  /// x = A^-1 b over 3 * vertex_count coordinates; rows of left-out vertices are unchanged. Thread-safe
+  /// if each thread has its own workspace.
   void solve(const double* b, double* x, CholeskyWorkspace& workspace) const;
 
-  /// x[r] = A^-1 b[r] for several right-hand sides, with the bits of one at a time.
+  /// x[r] = A^-1 b[r] for several right-hand sides, each with the same bits as alone.
   void solve(std::span<const double* const> b,
              std::span<double* const> x,
              CholeskyWorkspace& workspace) const;
 
-  /// The same with memory of its own for this call.
+  /// Solve with a temporary workspace.
   void solve(const double* b, double* x) const;
   void solve(std::span<const double* const> b, std::span<double* const> x) const;
 
   const std::shared_ptr<const CholeskyAnalysis>& analysis() const { return analysis_; }
 
-  /// What it is in: not always what was asked for.
+  /// Precision of the factor, which may differ from the requested one.
   Precision precision() const;
 
-  /// Memory of the factor, without that of the analysis.
+  /// Memory of the factor, without the analysis [bytes].
   std::size_t bytes() const;
 
  private:

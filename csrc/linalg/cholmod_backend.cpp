@@ -10,9 +10,9 @@
 #include "linalg/backend.h"
 #include "linalg/scalar_matrix.h"
 
-// Threads inside one small factorization cost more than they bring (most of the time went into
-// waiting for them), and would make results depend on their number. Present only where CHOLMOD is
-// linked to OpenBLAS, and to an OpenMP runtime.
+// Threads inside one small factorization cost more than they gain (most of the time was spent waiting),
+// and would make results depend on their number. The symbols exist only if CHOLMOD is linked to
+// OpenBLAS, and to an OpenMP runtime.
 extern "C" void openblas_set_num_threads(int) __attribute__((weak));
 extern "C" int omp_get_max_active_levels() __attribute__((weak));
 extern "C" void omp_set_max_active_levels(int) __attribute__((weak));
@@ -20,15 +20,15 @@ extern "C" void omp_set_max_active_levels(int) __attribute__((weak));
 namespace diffcloth::linalg {
 namespace {
 
-/// Whatever may reach the BLAS holds this: an OpenBLAS built for one thread, as distributions have
-/// it, has no locks, and calls from two threads at once corrupt each other.
+/// Lock for all calls that may reach the BLAS: an OpenBLAS built for one thread, as distributions ship
+/// it, has no locks, and concurrent calls from two threads corrupt each other.
 std::mutex& blas_mutex() {
   static std::mutex mutex;
   return mutex;
 }
 
-/// While it lives, OpenMP regions of this thread run on it alone. CHOLMOD names a number of threads
-/// in its own, so that only this limit binds it.
+/// Scope in which OpenMP regions of this thread run serially. CHOLMOD sets a number of threads in its
+/// regions, so that only this limit is effective.
 class SerialOpenMp {
  public:
   SerialOpenMp() {
@@ -45,7 +45,7 @@ class SerialOpenMp {
     return omp_get_max_active_levels != nullptr && omp_set_max_active_levels != nullptr &&
            levels() >= 0;
   }
-  // Read once, before the first change: some OpenMP libraries share the limit between threads.
+  // Read once, before the first change: some OpenMP libraries share this limit among threads.
   static int levels() {
     static const int before = omp_get_max_active_levels();
     return before;
@@ -73,7 +73,7 @@ struct Common {
   Common& operator=(const Common&) = delete;
 };
 
-/// The matrix as CHOLMOD sees it, without copying.
+/// View of the matrix for CHOLMOD, without copying.
 cholmod_sparse view(const ScalarMatrix& matrix, const double* values) {
   cholmod_sparse m{};
   m.nrow = m.ncol = static_cast<std::size_t>(matrix.dimension());
@@ -91,12 +91,12 @@ cholmod_sparse view(const ScalarMatrix& matrix, const double* values) {
 }
 
 std::size_t factor_bytes(const cholmod_factor& factor) {
-  // The values, the rows of the supernodes, and arrays over columns and supernodes.
+  // Values, rows of the supernodes, and arrays over columns and supernodes.
   return sizeof(double) * (factor.x != nullptr ? factor.xsize : 0) +
          sizeof(int) * (factor.ssize + 3 * (factor.nsuper + 1) + 2 * factor.n);
 }
 
-/// What the supernodal symbolic factorization says, scalars in and below each supernode.
+/// Call visit(columns, rows) for each supernode of the symbolic factorization, in scalars.
 template <class Visit>
 void for_each_supernode(const cholmod_factor& factor, Visit visit) {
   const auto* const super = static_cast<const int*>(factor.super);
@@ -118,10 +118,10 @@ double trace(const cholmod_factor& factor) {
   return sum;
 }
 
-/// Symbolic factorization, and the matrix that it is of.
+/// Symbolic factorization with its matrix.
 struct Structure {
   ScalarMatrix matrix;
-  mutable std::mutex mutex;  // of `common`, which copies of the factor are made with
+  mutable std::mutex mutex;  // guards `common` while factors are copied
   mutable Common common;
   cholmod_factor* symbolic = nullptr;
 
@@ -164,7 +164,7 @@ class CholmodFactor final : public FactorBackend {
     cholmod_sparse matrix = view(structure_.matrix, values_.data());
     cholmod_factorize(&matrix, factor_, &common_.c);
     if (common_.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
-    // A BLAS may let NaN pass for a pivot; it then stands on the diagonal.
+    // A BLAS may accept NaN as a pivot; it then appears on the diagonal.
     const bool positive = common_.c.status == CHOLMOD_OK && factor_->minor == factor_->n &&
                           std::isfinite(trace(*factor_));
     return positive ? Verdict::kPositive : Verdict::kIndefinite;
@@ -204,7 +204,7 @@ class CholmodFactor final : public FactorBackend {
     return static_cast<const double*>(x_->x);
   }
 
-  /// The solver's vectors: three of the factor's height at most.
+  /// The solver's vectors: at most three of the factor's height.
   std::size_t dense_bytes() const {
     return 3 * sizeof(double) * (factor_ != nullptr ? factor_->n : 0);
   }

@@ -10,7 +10,8 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// The largest magnitude. Several maxima at once: each would wait for the one before.
+/// Largest magnitude. Four maxima are computed side by side, because a single one is a chain of
+/// dependent operations.
 double largest_magnitude(const std::vector<double>& values) {
   std::array<double, 4> largest{};
   for (std::size_t k = 0; k < values.size(); ++k) {
@@ -19,27 +20,27 @@ double largest_magnitude(const std::vector<double>& values) {
   return *std::ranges::max_element(largest);
 }
 
-/// The way of one right side.
+/// State of the iteration for one right-hand side.
 struct Descent {
   /// @param b      [size or more]
-  /// @param first  [size] what the preconditioner makes of b
+  /// @param first  [size] the preconditioner applied to b
   Descent(std::vector<double> b, std::vector<double> first)
       : x(first.size(), 0.0), r(std::move(b)), z(first), p(std::move(first)), q(p.size()) {
     r.resize(p.size());
     rz = dot(r, z);
   }
 
-  /// Go to the minimum along p. False where its curvature is not positive.
+  /// Move to the minimum along p. Returns false if the curvature along p is not positive.
   bool advance(const BlockValues& A) {
     std::ranges::fill(q, 0.0);
     A.add_product(p.data(), q.data());
     return go();
   }
 
-  /// The same, when q is what the matrix makes of p.
+  /// Same, with q = A p already computed.
   bool go() { return go(dot(p, q)); }
 
-  /// The same, with p . q.
+  /// Same, with p . q given.
   bool go(double curvature) {
     if (!(curvature > 0.0)) return false;
     const double alpha = rz / curvature;
@@ -50,10 +51,10 @@ struct Descent {
     return true;
   }
 
-  /// Turn to the next direction, when z is what the preconditioner makes of r.
+  /// Compute the next direction, with z the preconditioner applied to r.
   void turn() { turn(dot(r, z)); }
 
-  /// The same, with r . z.
+  /// Same, with r . z given.
   void turn(double next) {
     const double beta = next / rz;
     last = rz;
@@ -61,7 +62,7 @@ struct Descent {
     for (std::size_t k = 0; k < p.size(); ++k) p[k] = z[k] + beta * p[k];
   }
 
-  /// Residual, squared, to which the next iteration should lead: it shrinks as in the last one.
+  /// Expected squared residual after the next iteration, if it contracts as the last one did.
   double expected() const { return rz * rz / last; }
 
   std::vector<double> x, r, z, p, q;
@@ -69,7 +70,7 @@ struct Descent {
   double last = 0.0;  ///< rz before the last iteration
 };
 
-/// dot() of two vectors of each of several ways, which need not wait for each other.
+/// Dot products of two vectors of several right-hand sides, four at a time as independent operations.
 std::vector<double> dots(const std::vector<Descent>& descents,
                          const std::vector<std::size_t>& of,
                          std::vector<double> Descent::* a,
@@ -163,7 +164,7 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
                                       int max_iterations,
                                       CholeskyWorkspace& workspace,
                                       std::vector<std::vector<double>>& x) {
-  // Products of residuals have twice the range of exponents.
+  // Squared residuals need twice the range of exponents: scale each right-hand side.
   std::vector<double> units;
   std::vector<std::vector<double>> right = b;
   for (std::vector<double>& values : right) {
@@ -181,7 +182,8 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
     if (descents[k].rz != 0.0) {
       left.push_back(k);
     } else {
-      // Nothing to do; but a product that underflows, beside huge numbers of vertices left out, is no zero.
+      // Nothing to do. However, an underflow of r . z, next to huge numbers at vertices left out, is not
+      // a zero residual.
       converged[k] = std::ranges::all_of(x[k], [](double value) { return value == 0.0; }) ? 1 : 0;
     }
   }
@@ -201,7 +203,7 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
       converged[k] = 0;
       return true;
     });
-    // The last residual is not looked at: that would take another solve.
+    // The last residual is not computed, because that would need another solve.
     std::erase_if(left, [&](std::size_t k) { return descents[k].expected() <= goals[k]; });
     from.clear();
     to.clear();

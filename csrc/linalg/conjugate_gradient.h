@@ -8,7 +8,7 @@
 
 namespace diffcloth::linalg {
 
-/// Sum in the order of the entries.
+/// Dot product, summed in the order of the entries.
 inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
   double sum = 0.0;
   for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
@@ -17,14 +17,14 @@ inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
 
 enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCurvature };
 
-/// Solve A x = b at the vertices that a factor of a nearby matrix does not leave out, preconditioned by
-/// it.
+/// Solve A x = b at the vertices that are not left out of the preconditioner, a factor of a nearby
+/// matrix.
 ///
-/// @param tolerance  on the residual in the preconditioner's norm, relative to b's
-/// @param fastest    contraction of the residual in an iteration that is seldom exceeded: the solve is given
-///                   up early if the remaining iterations would have to contract more
-/// @param x          in: what the preconditioner makes of b, zero at vertices left out; out: the best
-///                   iterate, however it ended
+/// @param tolerance  on the residual in the preconditioner's norm, relative to the norm of b
+/// @param fastest    contraction of the residual in an iteration that is seldom exceeded: the solve
+/// stops early if the remaining iterations would have to contract more
+/// @param x          in: the preconditioner applied to b, zero at vertices left out; out: the last
+/// iterate
 [[nodiscard]] Convergence conjugate_gradient(const BlockValues& A,
                                              const CholeskyFactor& preconditioner,
                                              const std::vector<double>& b,
@@ -34,7 +34,7 @@ enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCu
                                              CholeskyWorkspace& workspace,
                                              std::vector<double>& x);
 
-/// What a factor makes of several right sides, each with the bits that it has alone.
+/// Apply a factor to several right-hand sides, each with the same bits as alone.
 ///
 /// @param x  zero at vertices left out
 void solve(const CholeskyFactor& factor,
@@ -49,9 +49,9 @@ struct Agreement {
   int iterations;            ///< to get there
 };
 
-/// Test whether the factor of a matrix in single precision stands for it along a right side: conjugate gradients
-/// from x contract the residual as agreed. A direction in which A is negative would keep its share of the
-/// residual.
+/// Return whether the factor of a matrix in single precision is accurate along a right-hand side:
+/// conjugate gradients from x must contract the residual as specified by `agreement`. In a direction of
+/// negative curvature of A the residual would not decrease.
 ///
 /// @param x  solution by the factor alone
 [[nodiscard]] bool agrees(const BlockValues& A,
@@ -61,10 +61,10 @@ struct Agreement {
                           const Agreement& agreement,
                           CholeskyWorkspace& workspace);
 
-/// Solve A x = b for several right sides, each with the bits that it has alone, with a factor of A itself in
-/// single precision; which of them have converged.
+/// Solve A x = b for several right-hand sides, each with the same bits as alone, with a factor of A
+/// itself in single precision. Returns a flag for each: nonzero if converged.
 ///
-/// @param tolerance  on the residual in the factor's norm, relative to b's
+/// @param tolerance  on the residual in the factor's norm, relative to the norm of b
 /// @param x          zero at vertices left out
 [[nodiscard]] std::vector<char> conjugate_gradients(const BlockValues& A,
                                                     const CholeskyFactor& factor,

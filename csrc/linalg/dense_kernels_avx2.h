@@ -37,7 +37,7 @@ inline Doubles subtract_product_of(Doubles c, Doubles a, Doubles b) {
   return {{_mm256_fnmadd_pd(a.v[0], b.v[0], c.v[0]), _mm256_fnmadd_pd(a.v[1], b.v[1], c.v[1])}};
 }
 
-/// The sum of the lanes, in the one order that all levels have.
+/// Sum of the lanes, in the same order at all levels.
 inline double total(Doubles a) {
   const __m256d four = _mm256_add_pd(a.v[0], a.v[1]);
   const __m128d two = _mm_add_pd(_mm256_castpd256_pd128(four), _mm256_extractf128_pd(four, 1));
@@ -89,7 +89,7 @@ inline float total(Floats a) {
   return _mm_cvtss_f32(_mm_add_ss(two, _mm_shuffle_ps(two, two, 1)));
 }
 
-/// The same for fewer than sixteen.
+/// to += from for fewer than sixteen entries.
 inline void add_some(const float* from, int count, float* to) {
   int i = 0;
   if (count >= 8) {

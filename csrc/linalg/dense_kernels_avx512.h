@@ -25,7 +25,7 @@ inline Doubles subtract_product_of(Doubles c, Doubles a, Doubles b) {
   return {_mm512_fnmadd_pd(a.v, b.v, c.v)};
 }
 
-/// The sum of the lanes, in the one order that all levels have.
+/// Sum of the lanes, in the same order at all levels.
 inline double total(Doubles a) {
   const __m256d four = _mm256_add_pd(_mm512_maskz_extractf64x4_pd(0xF, a.v, 0),
                                      _mm512_maskz_extractf64x4_pd(0xF, a.v, 1));

@@ -3,11 +3,12 @@
 // ManyFloats of kMaxVectors floats, the operations on them, and
 //
 //   kPacks   packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
-//   kAcross  vectors that a product with a block takes in registers, a divisor of kMaxVectors
+//   kAcross  vectors in registers in a product with a block, a divisor of kMaxVectors
 //
-// A file that is compiled for a level of instructions must define nothing that another file may define too: the
-// linker would keep one copy, perhaps of instructions that the machine lacks. Headers for such files include
-// neither Eigen nor standard templates, and all their definitions are in anonymous namespaces.
+// A file that is compiled for a level of instructions must not define a symbol that another file may
+// define too: the linker would keep one copy, perhaps with instructions that the machine lacks. Headers
+// for such files include neither Eigen nor standard templates, and all their definitions are in
+// anonymous namespaces.
 
 #pragma once
 
@@ -15,7 +16,7 @@
 
 #include "linalg/dense_kernels.h"
 
-// Plain arrays: those of the standard library are templates that the whole program would share.
+// Plain arrays: std::array is a template that the whole program would share.
 // NOLINTBEGIN(modernize-avoid-c-arrays)
 
 #define DIFFCLOTH_INLINE inline __attribute__((always_inline))
@@ -37,8 +38,8 @@ struct Fronts {
 
   /// A block of P packs of rows and W columns in registers.
   ///
-  /// Its operands are in slabs: a pack of rows each, column after column, so that whatever a product reads
-  /// is contiguous. Slabs are `stride` apart.
+  /// Its operands are in slabs: each is a pack of rows, column after column, so that a product reads
+  /// contiguous memory. Slabs are `stride` apart.
   template <int P, int W>
   struct Tile {
     Pack c[W][P];
@@ -51,7 +52,7 @@ struct Fronts {
       }
     }
 
-    /// The first `columns` of them from a column-major matrix.
+    /// Load the first `columns` of W columns from a column-major matrix.
     DIFFCLOTH_INLINE void load_from(const Real* from, std::ptrdiff_t ld, int columns = W) {
 #pragma GCC unroll 8
       for (int j = 0; j < W; ++j) {
@@ -116,7 +117,7 @@ struct Fronts {
     }
   };
 
-  /// Call f<W>() for a width of 1 .. kWidth that is known only now.
+  /// Call f<W>() for a run-time width of 1 .. kWidth.
   template <int W = kWidth, class Call>
   static DIFFCLOTH_INLINE void with_width(int width, Call call) {
     if constexpr (W == 1) {
@@ -128,7 +129,7 @@ struct Fronts {
     }
   }
 
-  /// The same for a number of packs, 1 .. kPacks.
+  /// Same for a number of packs, 1 .. kPacks.
   template <int P = kPacks, class Call>
   static DIFFCLOTH_INLINE void with_packs(int packs, Call call) {
     if constexpr (P == 1) {
@@ -140,10 +141,10 @@ struct Fronts {
     }
   }
 
-  /// Some columns of a panel, at most kColumnBlock: the triangle on the diagonal and all rows below.
-  /// `slabs` takes what is finished.
+  /// At most kColumnBlock columns of a panel: the triangle on the diagonal and all rows below. `slabs`
+  /// receives the finished entries.
   struct Block {
-    Real* panel;  ///< where the triangle begins, with leading dimension ld
+    Real* panel;  ///< start of the triangle, with leading dimension ld
     std::ptrdiff_t ld;
     Real* slabs;
     std::ptrdiff_t stride;
@@ -172,8 +173,8 @@ struct Fronts {
     with_packs(packs, [&]<int P> { solve_rows<P>(block, row, begin, end); });
   }
 
-  /// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. What
-  /// it leaves above the diagonal means nothing.
+  /// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. Entries
+  /// above the diagonal are undefined.
   static Verdict factor_corner(Real* l, int columns) {
     for (int j = 0; j < columns; ++j) {
       Real* const l_j = l + kLanes * j;
@@ -194,7 +195,7 @@ struct Fronts {
     return Verdict::kPositive;
   }
 
-  /// The triangle of a block, a pack of columns at a time.
+  /// Factor the triangle of a block, a pack of columns at a time.
   static Verdict factor_triangle(const Block& block) {
     const int columns = block.columns;
     const int end = up_to_pack(columns);
@@ -222,8 +223,8 @@ struct Fronts {
     return Verdict::kPositive;
   }
 
-  /// C -= A B^T for P packs of rows and the columns that belong to one slab b, as far as they exist; C itself
-  /// counts as zero where nothing has been added to it.
+  /// C -= A B^T for P packs of rows and the existing columns of one slab b; if is_zero, C is overwritten
+  /// without being read.
   template <int P>
   static void subtract_from(Real* to,
                             std::ptrdiff_t ld,
@@ -245,13 +246,13 @@ struct Fronts {
     }
   }
 
-  /// What a finished block subtracts from `packs` packs of rows from `row` on of later columns, those of
-  /// the panel and those of the update matrix.
+  /// Subtract the contribution of a finished block from `packs` packs of rows, from `row` on, in later
+  /// columns of the panel and in the update matrix.
   static void update_rows(
       const Block& block, const Front& front, int first, int row, int packs, Real* panel, Real* u) {
     const int end = row + kLanes * packs;
     for (int strip = up_to_pack(block.columns); strip < end; strip += kLanes) {
-      const int from = strip < row ? row : strip;  // above are only entries of no meaning
+      const int from = strip < row ? row : strip;  // entries above are not meaningful
       const Real* const a = block.slabs + from / kLanes * block.stride;
       const Real* const b = block.slabs + strip / kLanes * block.stride;
       const int column = first + strip;
@@ -282,7 +283,7 @@ struct Fronts {
                         .columns = columns};
       const Verdict verdict = factor_triangle(block);
       if (verdict != Verdict::kPositive) return verdict;
-      // A few rows at a time, which stay in the cache: first those of later columns, then the others.
+      // Few rows at a time, which stay in the cache: first the rows of later columns, then the others.
       for (int row = up_to_pack(columns); first + row < end;) {
         const int bound = first + row < front.top ? front.top : end;
         const int rest = (bound - first - row) / kLanes;
@@ -332,8 +333,8 @@ struct Fronts {
     }
   }
 
-  /// y := L^-1 y for `Width` columns l of a panel from their diagonal on, in registers; of one vector where
-  /// Number is Real, of many where it is Many.
+  /// y := L^-1 y for `Width` columns l of a panel from their diagonal on, in registers; Number is Real
+  /// for one vector, Many for several.
   template <int Width, class Number>
   static DIFFCLOTH_INLINE void solve_triangle(const Real* l, std::ptrdiff_t ld, Number* y) {
     Number t[Width];
@@ -371,7 +372,7 @@ struct Fronts {
     for (int i = 0; i < Width; ++i) y[i] = t[i];
   }
 
-  /// A number, for each of the vectors.
+  /// Broadcast a number to all vectors.
   template <class Number>
   static DIFFCLOTH_INLINE Number same(Real a) {
     if constexpr (sizeof(Number) == sizeof(Real)) {
@@ -381,8 +382,8 @@ struct Fronts {
     }
   }
 
-  /// Call f<Width>() for the width of a triangle; supernodes are made of vertices of three columns each,
-  /// and widths below kLanes are what is left of those.
+  /// Call f<Width>() for the width of a triangle. A supernode has three columns for each vertex; widths
+  /// below kLanes are the remainder of its columns.
   template <int Width = 1, class Call>
   static DIFFCLOTH_INLINE void with_triangle(int width, Call call) {
     if constexpr (Width < kLanes) {
@@ -456,7 +457,7 @@ struct Fronts {
     }
   }
 
-  /// The triangle of a block of columns, of many vectors.
+  /// Solve with the triangle of a block of columns, for many vectors.
   template <bool kTransposed>
   static DIFFCLOTH_INLINE void solve_triangle_of_many(const Real* l,
                                                       std::ptrdiff_t ld,
@@ -498,8 +499,8 @@ struct Fronts {
     }
   }
 
-  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with many vectors. Sums have the order
-  /// of subtract_dots(): in lanes, here L of them at a time, which are added up in the order of total().
+  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with many vectors. Sums have the
+  /// order of subtract_dots(): by lane, here L lanes at a time, which are added in the order of total().
   template <int L, int W>
   static void subtract_dots_of_many(
       const Real* l, std::ptrdiff_t ld, int length, const Real* c, Real* y) {
@@ -567,7 +568,7 @@ DIFFCLOTH_INLINE const UnalignedFour& four(const double* from) {
   return *reinterpret_cast<const UnalignedFour*>(from);
 }
 
-/// Columns of a block, each in the first three lanes; nothing behind the block is read.
+/// Columns of a block, each in the first three lanes; no memory behind the block is read.
 struct Columns {
   Four c[3];
 
@@ -611,7 +612,7 @@ void multiply_blocks(const std::int32_t* column_start,
   }
 }
 
-/// Numbers of kAcross of kMaxVectors vectors.
+/// Numbers of kAcross vectors, of kMaxVectors.
 using Across = double __attribute__((vector_size(8 * kAcross)));
 using UnalignedAcross = double __attribute__((vector_size(8 * kAcross), aligned(8), may_alias));
 
@@ -619,7 +620,7 @@ DIFFCLOTH_INLINE const UnalignedAcross& across(const double* from) {
   return *reinterpret_cast<const UnalignedAcross*>(from);
 }
 
-/// The same for kAcross of kMaxVectors vectors, whose numbers lie side by side.
+/// Product for kAcross of kMaxVectors interleaved vectors.
 void multiply_some(const std::int32_t* __restrict column_start,
                    const std::int32_t* __restrict row,
                    std::int32_t size,

@@ -25,7 +25,7 @@ struct Floats {
   FourFloats v[4];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
 };
 
-/// Of kMaxVectors vectors.
+/// One float of each of kMaxVectors vectors.
 struct ManyFloats {
   using Real = float;
   FourFloats v[2];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
@@ -84,7 +84,7 @@ inline Pack operator*(Pack a, Pack b) {
   return a;
 }
 
-/// c - a b: rounded once where the processor can, as at the other levels, else twice.
+/// c - a b: rounded once if the processor has fused multiply-add, as at the other levels, else twice.
 inline double subtract_product_of(double c, double a, double b) {
 #ifdef __FP_FAST_FMA
   return __builtin_fma(-a, b, c);
@@ -113,7 +113,7 @@ inline Pack subtract_product_of(Pack c, Pack a, Pack b) {
   return c;
 }
 
-/// The sum of the lanes, in the one order that all levels have.
+/// Sum of the lanes, in the same order at all levels.
 inline double total(Doubles a) {
   const Two two = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
   return two[0] + two[1];

@@ -10,7 +10,7 @@ namespace {
 
 using Sparse = Eigen::SparseMatrix<double, Eigen::ColMajor, Index>;
 
-/// Shows L, whose pattern is known, and asked for, once it is analyzed; matrixL() wants its values.
+/// Gives access to the pattern of L after the analysis; matrixL() requires its values.
 class Solver final
     : public Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>> {
  public:
@@ -35,7 +35,7 @@ class EigenFactor final : public FactorBackend {
     if (matrix_.dimension() == 0) return Verdict::kPositive;
     matrix_.gather(blocks, values_);
     solver_.factorize(view(matrix_, values_.data()));
-    // Eigen compares pivots with zero, which NaN passes; a later NaN then stands on the diagonal.
+    // Eigen compares pivots with zero, which NaN passes; a NaN then appears on the diagonal.
     const bool positive = solver_.info() == Eigen::Success && std::isfinite(trace());
     return positive ? Verdict::kPositive : Verdict::kIndefinite;
   }
@@ -53,7 +53,7 @@ class EigenFactor final : public FactorBackend {
   }
 
   std::size_t bytes() const override {
-    // L, the tree and the counts of the columns, and work space of the solver.
+    // L, the tree and the counts of the columns, and the solver's work space.
     const auto n = static_cast<std::size_t>(matrix_.dimension());
     return sizeof(*this) + values_.capacity() * sizeof(double) +
            (sizeof(double) + sizeof(Index)) * nonzeros() + 4 * n * sizeof(Index);

@@ -11,7 +11,7 @@ std::vector<Index> inverse(const std::vector<Index>& order) {
   return rank;
 }
 
-/// Parents by Liu's algorithm: paths to roots found so far are compressed.
+/// Parents by Liu's algorithm, with path compression.
 std::vector<Index> parents(const Graph& graph,
                            const std::vector<Index>& order,
                            const std::vector<Index>& rank) {
@@ -39,7 +39,7 @@ std::vector<Index> postorder(const std::vector<Index>& parent) {
   std::vector<Index> first_child(n + 1, -1);
   std::vector<Index> next_sibling(n, -1);
   for (Index k = n - 1; k >= 0; --k) {
-    const Index p = parent[k] == -1 ? n : parent[k];  // node n stands above all roots
+    const Index p = parent[k] == -1 ? n : parent[k];  // node n is a common parent of all roots
     next_sibling[k] = first_child[p];
     first_child[p] = k;
   }
@@ -59,20 +59,20 @@ std::vector<Index> postorder(const std::vector<Index>& parent) {
   return result;
 }
 
-/// Heights of the columns. Row i of L is the part of the tree between i and its neighbors below it: each
-/// leaf of that part adds a path, of which the columns above where it joins the last one are known. Only
-/// leaves are counted, at both ends of these paths, and summed up the tree (Gilbert, Ng, Peyton 1994).
+/// Heights of the columns. Row i of L is a subtree, between i and its neighbors below it in the tree.
+/// Each leaf of the subtree adds a path up to its joint with the path of the previous leaf. Only the two
+/// ends of each path are counted, and the counts are summed up the tree (Gilbert, Ng, Peyton 1994).
 std::vector<Index> heights(const Graph& graph, const EliminationTree& tree) {
   const Index n = graph.size();
   std::vector<Index> height(n, 0);
-  std::vector<Index> first(n, -1);  // first column in the subtree of one
+  std::vector<Index> first(n, -1);  // first column in the subtree of each column
   for (Index k = 0; k < n; ++k) {
     if (first[k] == -1) height[k] = 1;
     for (Index j = k; j != -1 && first[j] == -1; j = tree.parent[j]) first[j] = k;
   }
-  std::vector<Index> highest_first(n, -1);  // of the leaves of a row so far
+  std::vector<Index> highest_first(n, -1);  // largest `first` among the leaves of a row so far
   std::vector<Index> last_leaf(n, -1);
-  std::vector<Index> ancestor(n);  // the root of what is counted, with compressed paths
+  std::vector<Index> ancestor(n);  // root of the visited part, with path compression
   for (Index k = 0; k < n; ++k) ancestor[k] = k;
   for (Index k = 0; k < n; ++k) {
     const Index parent = tree.parent[k];

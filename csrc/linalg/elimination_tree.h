@@ -6,15 +6,16 @@
 
 namespace diffcloth::linalg {
 
-/// Which column of L each column modifies first, for nodes eliminated in a postorder of that tree.
+/// Elimination tree: the parent of a column of L is the first column it modifies. Columns are in
+/// postorder.
 struct EliminationTree {
-  std::vector<Index> order;   ///< [n] node eliminated k-th
-  std::vector<Index> rank;    ///< [n] its inverse
-  std::vector<Index> parent;  ///< [n] of the k-th, -1 at a root; larger than k
-  std::vector<Index> height;  ///< [n] entries of column k of L, the diagonal included
+  std::vector<Index> order;   ///< [n] k-th eliminated node
+  std::vector<Index> rank;    ///< [n] inverse of `order`
+  std::vector<Index> parent;  ///< [n] parent of the k-th, larger than k; -1 at a root
+  std::vector<Index> height;  ///< [n] entries of column k of L, including the diagonal
 };
 
-/// The tree for an order of elimination, which is replaced by an equivalent postorder.
+/// Elimination tree of an order, which is replaced by an equivalent postorder.
 EliminationTree eliminate(const Graph& graph, std::vector<Index> order);
 
 }  // namespace diffcloth::linalg

@@ -9,7 +9,7 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// Basis vectors before a restart: their memory and the work of keeping them orthogonal.
+/// Number of basis vectors before a restart; bounds memory and the cost of orthogonalization.
 constexpr int kBasis = 60;
 
 using Map = Eigen::Map<Eigen::VectorXd>;
@@ -32,7 +32,7 @@ GmresOutcome gmres(const LinearMap& apply,
   int iterations = 0;
   std::vector<std::vector<double>> basis;
   while (true) {
-    // w: the preconditioned residual of x.
+    // w is the preconditioned residual of x.
     double residual = view(w).norm();
     if (residual <= goal) return {.converged = true, .iterations = iterations};
     if (!std::isfinite(residual) || iterations >= max_iterations) {

@@ -33,7 +33,7 @@ Graph unknown_graph(const BlockPattern& pattern, const std::vector<char>& fixed)
   for (Index k = 0; k < graph.size(); ++k) graph.start[k + 1] += graph.start[k];
   graph.neighbor.resize(static_cast<std::size_t>(graph.start.back()));
 
-  // Smaller neighbors come with the columns, in their order; then the larger ones of each column.
+  // Smaller neighbors are visited in the order of the columns; then the larger ones of each column.
   std::vector<Index> next = graph.start;
   for_each_coupling(pattern, node, [&](Index i, Index j) { graph.neighbor[next[i]++] = j; });
   for_each_coupling(pattern, node, [&](Index i, Index j) { graph.neighbor[next[j]++] = i; });

@@ -6,11 +6,11 @@
 
 namespace diffcloth::linalg {
 
-/// Which unknown vertices of a pattern are coupled: an undirected graph without loops.
+/// Couplings of the unknown vertices of a pattern: an undirected graph without loops.
 struct Graph {
   std::vector<Index> start;     ///< [size + 1] neighbors of node k: start[k] .. start[k + 1] - 1
   std::vector<Index> neighbor;  ///< ascending for each node
-  std::vector<Index> vertex;    ///< [size] vertex of the pattern that node k is, ascending
+  std::vector<Index> vertex;    ///< [size] vertex of the pattern for each node, ascending
 
   Index size() const { return static_cast<Index>(vertex.size()); }
 };

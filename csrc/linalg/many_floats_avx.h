@@ -1,5 +1,6 @@
-// What the kernels of AVX2 and of AVX-512 have in common: ManyFloats, which are half a register of the latter, and
-// products of single numbers. Everything is in an anonymous namespace, for the reason given in dense_kernels_impl.h.
+// Definitions common to the kernels for AVX2 and AVX-512: ManyFloats, which is half a register of
+// AVX-512, and products of single numbers. Everything is in an anonymous namespace, for the reason given
+// in dense_kernels_impl.h.
 
 #pragma once
 
@@ -8,7 +9,7 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// Of kMaxVectors vectors.
+/// One float of each of kMaxVectors vectors.
 struct ManyFloats {
   using Real = float;
   __m256 v;

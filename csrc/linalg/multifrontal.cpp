@@ -52,16 +52,16 @@ class Stopwatch {
   Clock::time_point last_;
 };
 
-/// Numbers of a cache line.
+/// Numbers in a cache line.
 template <class Real>
 constexpr Index kLine = 64 / sizeof(Real);
 
-/// Places for the update matrices that tasks leave to others, always the lowest that is free: few are
-/// alive at once, but which ones depends on the threads.
+/// Allocator of the update matrices that tasks leave to others; each gets the lowest free place. Few are
+/// alive at a time, but which ones depends on the threads.
 template <class Real>
 class Shelf {
  public:
-  /// @param memory  of the size of all of them
+  /// @param memory  room for all update matrices
   Shelf(const std::vector<Task>& tasks, Real* memory) : memory_(memory) {
     place_.reserve(tasks.size());
     for (const Task& task : tasks) place_.push_back({.begin = 0, .size = task.update});
@@ -78,7 +78,7 @@ class Shelf {
     taken_.insert(gap, {.begin = place.begin, .end = place.begin + place.size, .task = task});
   }
 
-  /// Give back all but the last `left` numbers.
+  /// Release all but the last `left` numbers.
   void give_back(Index task, std::size_t left) {
     const std::lock_guard lock(mutex_);
     const auto extent = std::ranges::find(taken_, task, &Extent::task);
@@ -112,8 +112,8 @@ const FrontKernels<float>& fronts(const DenseKernels& kernels, float /*precision
 
 /// Multifrontal A = L L^T [Duff and Reid 1983; Liu 1992], in double or single precision.
 ///
-/// The latter has its own range: what is factored is S A S, with powers of two S that bring the
-/// diagonal between 1 and 4.
+/// Single precision has a smaller range: the factored matrix is S A S, with powers of two S that scale
+/// the diagonal to between 1 and 4.
 template <class Real>
 class MultifrontalFactor final : public FactorBackend {
  public:
@@ -131,10 +131,10 @@ class MultifrontalFactor final : public FactorBackend {
     Real* const memory = workspace.reserve<Real>(s_.left_size + own * members(workspace));
     Shelf<Real> shelf(s_.tasks, memory);
     const auto tasks = static_cast<Index>(s_.tasks.size());
-    // The first work that fails decides, whatever others that run beside it find.
+    // The first failure in the order of the work decides, regardless of concurrent failures.
     std::atomic<Index> failed = 2 * tasks;
     std::vector<Verdict> verdicts(s_.tasks.size(), Verdict::kPositive);
-    // Work 2 k eliminates task k, work 2 k + 1 hands on what it leaves.
+    // Work item 2 k eliminates task k; item 2 k + 1 adds its update matrix to the panel above.
     const auto ready = [&](Index i, const Team::Done& done) {
       const Index k = i / 2;
       if (i % 2 == 0) return has_all(k, [&](Index child) { return done[2 * child + 1] != 0; });
@@ -184,13 +184,14 @@ class MultifrontalFactor final : public FactorBackend {
  private:
   static constexpr bool kIsScaled = std::is_same_v<Real, float>;
 
-  /// Of the processor: numbers decay with the distance in the sheet, in single precision to nothing.
+  /// Floating-point mode without flushing. Flushing matters in single precision: numbers decay with the
+  /// distance in the sheet, down to subnormal ones.
   struct Ordinary {
     Ordinary() {}  // NOLINT(modernize-use-equals-default): or the variable would count as unused
   };
   using Mode = std::conditional_t<kIsScaled, FlushSubnormals, Ordinary>;
 
-  /// Find the scale of each unknown. False where the diagonal is not positive and finite.
+  /// Compute the scale of each unknown. Returns false if the diagonal is not positive and finite.
   bool find_scale(const double* blocks) {
     scale_.resize(3 * s_.vertex.size());
     for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
@@ -203,12 +204,12 @@ class MultifrontalFactor final : public FactorBackend {
     return true;
   }
 
-  /// Threads that work: one where there is one task.
+  /// Number of working threads: one if there is one task.
   std::size_t members(CholeskyWorkspace& workspace) const {
     return s_.tasks.size() > 1 ? static_cast<std::size_t>(workspace.team().size()) : 1;
   }
 
-  /// Run a loop over tasks on as many.
+  /// Run a loop over tasks on that many threads.
   void run(CholeskyWorkspace& workspace,
            Index count,
            const Team::Ready& ready,
@@ -222,7 +223,8 @@ class MultifrontalFactor final : public FactorBackend {
 
   const Supernode& root_of(Index task) const { return s_.supernodes[s_.tasks[task].end - 1]; }
 
-  /// Call visit(task) for the tasks whose roots are children of a supernode that joins them, in order.
+  /// Call visit(task), in order, for the tasks whose roots are children of the supernode of a joining
+  /// task.
   template <class Visit>
   void for_children(Index task, Visit visit) const {
     if (!s_.tasks[task].joins) return;
@@ -232,7 +234,7 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  /// Whether all of these tasks fulfill something.
+  /// True if all child tasks pass the test.
   template <class Test>
   bool has_all(Index task, Test test) const {
     bool all = true;
@@ -240,7 +242,7 @@ class MultifrontalFactor final : public FactorBackend {
     return all;
   }
 
-  /// The task before it among the children of their parent, or -1.
+  /// Preceding task among the children of the same parent, or -1.
   Index elder(Index task) const {
     const Supernode& root = root_of(task);
     if (root.parent == -1 || root.as_child == s_.supernodes[root.parent].children_begin) return -1;
@@ -249,7 +251,7 @@ class MultifrontalFactor final : public FactorBackend {
 
   /// Eliminate the supernodes of a task.
   ///
-  /// @param arena  of the thread; behind it is scratch for the kernels
+  /// @param arena  of the thread; followed by scratch for the kernels
   Verdict eliminate(
       Index task, const double* blocks, Shelf<Real>& shelf, Real* arena, Stopwatch& watch) {
     shelf.take(task);
@@ -266,7 +268,7 @@ class MultifrontalFactor final : public FactorBackend {
     return Verdict::kPositive;
   }
 
-  /// Add to the panel above a task what belongs there of the update matrix that it leaves.
+  /// Add to the panel above a task the columns of its update matrix that belong there.
   void hand_on(Index task, const double* blocks, Shelf<Real>& shelf, Stopwatch& watch) {
     const Supernode& root = root_of(task);
     if (root.parent == -1) return;
@@ -274,7 +276,8 @@ class MultifrontalFactor final : public FactorBackend {
     shelf.give_back(task, left_size(root));
   }
 
-  /// Finish a supernode's columns of L, which its children have added to, and find its update matrix.
+  /// Finish a supernode's columns of L, which already include its children's updates, and compute its
+  /// update matrix.
   Verdict eliminate(const Supernode& node,
                     const double* blocks,
                     const Shelf<Real>& shelf,
@@ -285,7 +288,7 @@ class MultifrontalFactor final : public FactorBackend {
       assemble(node, blocks);
       watch.lap(&CholeskySeconds::assembly);
     }
-    // The update matrix is written before anything is added to it: it need not be cleared.
+    // The kernel overwrites the update matrix before children are added, so that it need not be cleared.
     Real* const panel = factor_.data() + node.panel;
     const Verdict verdict = kernels_.factor(node.front, panel, u, arena + s_.arena_size);
     watch.lap(&CholeskySeconds::dense);
@@ -300,7 +303,7 @@ class MultifrontalFactor final : public FactorBackend {
     return Verdict::kPositive;
   }
 
-  /// Add to the parent's panel what belongs there; the first child begins it.
+  /// Add a supernode's update to the parent's panel; the first child also assembles that panel.
   void add_to_parent(const Supernode& node, const double* blocks, const Real* u, Stopwatch& watch) {
     const Supernode& parent = s_.supernodes[node.parent];
     if (node.as_child == parent.children_begin) {
@@ -312,12 +315,12 @@ class MultifrontalFactor final : public FactorBackend {
     watch.lap(&CholeskySeconds::extend_add);
   }
 
-  /// Size of what is left of the update matrix behind the columns that its parent's panel takes.
+  /// Size of the rest of the update matrix, behind the columns added to the parent's panel.
   std::size_t left_size(const Supernode& node) const {
     return s_.tasks[node.task].update - s_.taken_size(node);
   }
 
-  /// Begin a supernode's panel: with the columns of A.
+  /// Initialize a supernode's panel with the columns of A.
   void assemble(const Supernode& node, const double* blocks) {
     Real* const panel = factor_.data() + node.panel;
     const auto size = static_cast<std::size_t>(node.front.panel().size(node.front.columns));
@@ -327,7 +330,7 @@ class MultifrontalFactor final : public FactorBackend {
       const double* const a = blocks + 9 * static_cast<std::ptrdiff_t>(block.slot);
       Real* const to = panel + block.place;
       const std::ptrdiff_t ld = block.stride;
-      // Which are transposed is as good as random: no branch.
+      // Transposition is unpredictable, hence no branch.
       const std::ptrdiff_t down = block.transposed != 0 ? 3 : 1;
       const std::ptrdiff_t across = 4 - down;
       if constexpr (kIsScaled) {
@@ -353,15 +356,15 @@ class MultifrontalFactor final : public FactorBackend {
             .run_count = child.run_count};
   }
 
-  /// Right-hand sides on their way through the factor, R to an entry; those beyond the given ones are zero.
+  /// Right-hand sides during a solve, R numbers an entry; unused lanes are zero.
   template <int R>
   struct Vectors {
     std::span<const double* const> b;
     std::span<double* const> x;
     Real* y;       ///< in the order of elimination
-    Real* passed;  ///< what tasks have to subtract from rows of others
+    Real* passed;  ///< updates that tasks pass to rows of other tasks
 
-    /// Powers of two that the scaled right sides are divided by, so that they have the range of a Real.
+    /// Powers of two that divide the scaled right-hand sides, so that they are in the range of Real.
     std::array<double, R> unit;
     std::array<double, R> inverse;
 
@@ -374,7 +377,7 @@ class MultifrontalFactor final : public FactorBackend {
                   CholeskyWorkspace& workspace) const {
     const std::size_t n = 3 * s_.vertex.size();
     const auto longest = static_cast<std::size_t>(s_.longest);
-    // Of each thread: vectors of its own, and behind them a front.
+    // Memory of each thread: its vectors, followed by a front.
     constexpr std::size_t kPadding = kLine<Real>;
     const std::size_t own = (n + longest + kPadding) / kPadding * kPadding;
     const std::size_t all = own * members(workspace);
@@ -406,7 +409,7 @@ class MultifrontalFactor final : public FactorBackend {
     std::array<double, R> result;
     result.fill(1.0);
     if (!kIsScaled) return result;
-    // A maximum waits for the one before: all sides and coordinates at once.
+    // A single maximum is a chain of dependent operations: process all sides and coordinates at once.
     std::array<std::array<double, 3>, R> largest{};
     for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
       const std::size_t place = 3 * static_cast<std::size_t>(s_.vertex[k]);
@@ -417,13 +420,13 @@ class MultifrontalFactor final : public FactorBackend {
       }
     }
     for (std::size_t r = 0; r < b.size(); ++r) {
-      // Their inverses are to be normal numbers.
+      // The inverses must be normal numbers.
       result[r] = std::clamp(leading_power(std::ranges::max(largest[r])), 0x1p-1022, 0x1p1022);
     }
     return result;
   }
 
-  /// Rows of a vertex on their way in.
+  /// Load the rows of a vertex from the right-hand sides.
   template <int R>
   void take(const Vectors<R>& v, Index k, Real* to) const {
     const std::ptrdiff_t place = 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
@@ -443,7 +446,7 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  /// The same on their way out.
+  /// Store the rows of a vertex to the solutions.
   template <int R>
   void give(const Vectors<R>& v, const Real* from, Index k) const {
     const std::ptrdiff_t place = 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
@@ -460,7 +463,7 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  /// Where the rows of a vertex begin.
+  /// Offset of the rows of a vertex.
   template <int R>
   static std::ptrdiff_t entry(Index vertex) {
     return std::ptrdiff_t{3 * R} * vertex;
@@ -468,7 +471,7 @@ class MultifrontalFactor final : public FactorBackend {
 
   /// y := L^-1 y in the columns of a task.
   ///
-  /// @param z  [n] vectors of the thread: the right side less what has been subtracted from it
+  /// @param z  [n] vectors of the thread: the right-hand side minus the updates so far
   template <int R>
   void forward(Index k, const Vectors<R>& v, Real* z, Real* c) const {
     const Task& task = s_.tasks[k];
@@ -540,7 +543,7 @@ class MultifrontalFactor final : public FactorBackend {
   std::vector<double> scale_;  // [3 n] in the order of elimination; empty for doubles
 };
 
-/// The layouts of both precisions, each made when the first factor needs it.
+/// Layouts of both precisions, each computed when the first factor needs it.
 class MultifrontalAnalysis final : public AnalysisBackend {
  public:
   MultifrontalAnalysis(Elimination elimination, KernelLevel level)

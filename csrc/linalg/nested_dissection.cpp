@@ -15,18 +15,18 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// Parts of no more nodes are left to minimum degree, which does no worse on them.
+/// Largest part that is ordered by minimum degree, which is as good at this size.
 constexpr Index kSmallPart = 400;
-/// Distances from so many nodes far from each other say where a node is.
+/// Number of landmarks: nodes far from each other; the distances from them locate a node.
 constexpr int kLandmarks = 4;
-/// Means over neighbors that turn whole-numbered distances into smooth coordinates.
+/// Number of averaging sweeps that smooth coordinates from integer distances.
 constexpr int kSmoothings = 8;
-/// Directions in which a part may be cut.
+/// Number of directions in which a part may be cut.
 constexpr int kDirections = 8;
 
 using Coordinates = std::vector<Eigen::Vector2d>;
 
-/// Subgraph of some nodes, numbered in their order. `number` is scratch, -1 everywhere.
+/// Subgraph of the given nodes, numbered in their order. `number` is scratch, -1 everywhere.
 Graph induced(const Graph& graph, const std::vector<Index>& nodes, std::vector<Index>& number) {
   Graph part;
   for (std::size_t k = 0; k < nodes.size(); ++k) number[nodes[k]] = static_cast<Index>(k);
@@ -42,7 +42,7 @@ Graph induced(const Graph& graph, const std::vector<Index>& nodes, std::vector<I
   return part;
 }
 
-/// Number of edges from a node to each other, -1 where there is no path.
+/// Number of edges from a node to every other, -1 if there is no path.
 std::vector<Index> distances(const Graph& part, Index from) {
   std::vector<Index> distance(part.size(), -1);
   std::vector<Index> queue{from};
@@ -59,8 +59,8 @@ std::vector<Index> distances(const Graph& part, Index from) {
   return distance;
 }
 
-/// Two coordinates of each node of a connected part: the principal directions of its distances from
-/// landmarks, each of which is as far from the earlier ones as can be.
+/// Two coordinates of each node of a connected part: the principal components of its distances from
+/// landmarks, each of which is as far as possible from the earlier ones.
 Coordinates embed(const Graph& part) {
   using Vector = Eigen::Matrix<double, kLandmarks, 1>;
   const Index n = part.size();
@@ -104,7 +104,7 @@ void smooth(const Graph& part, Coordinates& x) {
   }
 }
 
-/// Which half each node is in, when they are cut across a direction.
+/// Half of each node after a cut across a direction.
 std::vector<char> halves(const Coordinates& x, const Eigen::Vector2d& direction) {
   std::vector<std::pair<double, Index>> along(x.size());
   for (std::size_t i = 0; i < x.size(); ++i) {
@@ -130,7 +130,7 @@ std::array<std::vector<Index>, 2> boundaries(const Graph& part, const std::vecto
   return result;
 }
 
-/// The fewest nodes that cover all edges between two halves: by Konig's theorem, from a largest
+/// Smallest set of nodes that covers all edges between two halves: by Konig's theorem, from a maximum
 /// matching of their boundaries.
 class VertexCover {
  public:
@@ -142,7 +142,7 @@ class VertexCover {
     for (const Index i : first) {
       if (mate_[i] == -1) augment(i, i);
     }
-    // What alternating paths reach from the unmatched nodes of the first half.
+    // Mark nodes reached by alternating paths from unmatched nodes of the first half.
     const Index round = part_.size();
     for (const Index i : first) {
       if (mate_[i] == -1) reach(i, round);
@@ -158,7 +158,7 @@ class VertexCover {
   }
 
  private:
-  /// Match node i of the first half, moving others to further nodes where that is needed.
+  /// Match node i of the first half, rematching others if necessary.
   bool augment(Index i, Index round) {
     for (Index e = part_.start[i]; e < part_.start[i + 1]; ++e) {
       const Index j = part_.neighbor[e];
@@ -179,7 +179,7 @@ class VertexCover {
       const Index j = part_.neighbor[e];
       if (half_[j] == 0 || seen_[j] == round) continue;
       seen_[j] = round;
-      // An unmatched j would have made the matching larger.
+      // An unmatched j would have enlarged the matching.
       if (seen_[mate_[j]] != round) reach(mate_[j], round);
     }
   }
@@ -187,10 +187,10 @@ class VertexCover {
   const Graph& part_;
   const std::vector<char>& half_;
   std::vector<Index> mate_;
-  std::vector<Index> seen_;  // last search that came by
+  std::vector<Index> seen_;  // last search that reached the node
 };
 
-/// 0 or 1: half of a node; 2: it separates them. For a connected part.
+/// Half of each node (0 or 1), or 2 for the separator. For a connected part.
 std::vector<char> bisect(const Graph& part) {
   Coordinates x = embed(part);
   smooth(part, x);
@@ -223,7 +223,7 @@ class Dissection {
 
  private:
   void dissect(std::vector<Index> nodes) {
-    // One component after the other, in a loop: there may be as many as nodes, too deep to nest.
+    // Components are processed in a loop: as many as there are nodes would be too deep a recursion.
     for (;;) {
       const Graph part = induced(graph_, nodes, number_);
       if (part.size() <= kSmallPart) {
@@ -245,7 +245,7 @@ class Dissection {
     }
   }
 
-  /// For a connected part.
+  /// Cut a connected part.
   void cut(const Graph& part, const std::vector<Index>& nodes) {
     std::array<std::vector<Index>, 3> parts;
     const std::vector<char> where = bisect(part);
@@ -255,8 +255,8 @@ class Dissection {
     order_.insert(order_.end(), parts[2].begin(), parts[2].end());
   }
 
-  /// Minimum degree with the separators around the part in sight, as one clique, which they will
-  /// have become: degrees at the rim of the part are then what they are in the whole.
+  /// Minimum degree on the part and its surrounding separators. The separators form one clique, as they
+  /// will after elimination, so that degrees at the part's boundary equal those in the whole graph.
   void order_part(const std::vector<Index>& nodes) {
     std::vector<Index> extended = nodes;
     for (const Index node : nodes) number_[node] = 0;

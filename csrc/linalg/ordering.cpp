@@ -11,7 +11,7 @@ namespace diffcloth::linalg {
 
 namespace {
 
-/// From here on the work that nested dissection saves is more than it costs.
+/// Graph size from which nested dissection saves more than it costs.
 constexpr Index kLargeGraph = 5000;
 
 }  // namespace
@@ -38,7 +38,7 @@ std::vector<Index> minimum_degree_order(const Graph& graph) {
   const Index n = graph.size();
   std::vector<Index> order(n);
   if (n == 0) return order;
-  // Eigen takes nodes without a diagonal entry for dense ones, which come last.
+  // Eigen's AMD treats nodes without a diagonal entry as dense ones, which come last.
   std::vector<Index> start(graph.start);
   std::vector<Index> row;
   row.reserve(graph.neighbor.size() + order.size());

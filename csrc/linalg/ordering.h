@@ -7,7 +7,7 @@
 
 namespace diffcloth::linalg {
 
-/// How an order that fills little is found.
+/// Algorithm of the fill-reducing order.
 enum class Ordering : std::uint8_t {
   kAutomatic,        ///< minimum degree on small graphs, nested dissection on large ones
   kMinimumDegree,    ///< approximate minimum degree
@@ -16,7 +16,7 @@ enum class Ordering : std::uint8_t {
 
 const char* name(Ordering ordering);
 
-/// Nodes in the order in which elimination should fill little: order[k] is the k-th.
+/// Fill-reducing elimination order: order[k] is the k-th node.
 std::vector<Index> fill_reducing_order(const Graph& graph,
                                        Ordering ordering = Ordering::kAutomatic);
 

@@ -8,12 +8,12 @@
 
 namespace diffcloth::linalg {
 
-/// The matrix of a block pattern as libraries take it: the lower triangle of its scalars in the
-/// order of elimination, in compressed columns.
+/// Matrix of a block pattern in the format of libraries: the lower triangle of its scalars in the order
+/// of elimination, in compressed columns.
 struct ScalarMatrix {
   std::vector<Index> column_start;
   std::vector<Index> row;
-  std::vector<Index> source;   ///< place of each scalar among the pattern's block values
+  std::vector<Index> source;   ///< index of each scalar among the pattern's block values
   std::vector<Index> unknown;  ///< coordinate (3 vertex + axis) of each column
 
   explicit ScalarMatrix(const Elimination& elimination);
@@ -21,7 +21,7 @@ struct ScalarMatrix {
   Index dimension() const { return static_cast<Index>(unknown.size()); }
   std::size_t bytes() const;
 
-  /// The scalars of these blocks, in the order of `row`.
+  /// Gather the scalars from block values, in the order of `row`.
   void gather(const double* blocks, std::vector<double>& values) const;
 };
 

@@ -25,7 +25,7 @@ inline std::ptrdiff_t slot_of(const std::int32_t* start,
   const std::int32_t* first = rows + start[j];
   std::int32_t count = start[j + 1] - start[j];
   const __m512i wanted = _mm512_set1_epi32(i);
-  // Most columns fit in two registers: no branch but for longer ones.
+  // Most columns fit in two registers: the loop runs only for longer ones.
   for (; __builtin_expect(count > 2 * kLanes, 0) && first[2 * kLanes - 1] < i;
        count -= 2 * kLanes) {
     first += 2 * kLanes;
@@ -33,7 +33,7 @@ inline std::ptrdiff_t slot_of(const std::int32_t* start,
   const std::uint64_t exist = count >= 2 * kLanes ? 0xFFFFFFFFU : (std::uint64_t{1} << count) - 1U;
   const auto low = static_cast<__mmask16>(exist);
   const auto high = static_cast<__mmask16>(exist >> kLanes);
-  // Lanes that a mask leaves out are not read.
+  // Masked-out lanes are not read.
   const auto found_among = [&](__mmask16 lanes, const std::int32_t* from) -> std::uint32_t {
     return _mm512_mask_cmpeq_epi32_mask(lanes, _mm512_maskz_loadu_epi32(lanes, from), wanted);
   };
@@ -43,8 +43,8 @@ inline std::ptrdiff_t slot_of(const std::int32_t* start,
 
 #else
 
-/// See BlockPattern::slot(). Columns differ in length, and a loop that ends somewhere else each time costs more
-/// than steps that do nothing.
+/// See BlockPattern::slot(). Columns differ in length, and a loop with an unpredictable end costs more
+/// than steps without effect.
 inline __attribute__((always_inline)) std::ptrdiff_t slot_of(const std::int32_t* start,
                                                              const std::int32_t* rows,
                                                              std::int32_t i,

@@ -6,39 +6,39 @@
 
 namespace diffcloth::linalg {
 
-/// Points of the largest stencil.
+/// Number of points of the largest stencil.
 inline constexpr int kStencilPoints = 5;
 
-// Plain arrays and pointers: those of the standard library are templates, see linalg/dense_kernels_impl.h.
+// Plain arrays and pointers: std::array is a template, see linalg/dense_kernels_impl.h.
 // NOLINTBEGIN(modernize-avoid-c-arrays)
 
-/// The symmetric matrix of a few points, by what it is made of:
+/// Factors of the symmetric matrix of a few points:
 ///
-///   sum_k left_k right_k^T + along c c^T (x) I + rest + the turning of an edge by another,
+///   sum_k left_k right_k^T + along c c^T (x) I + rest + cross product of two edges with `turn`,
 ///
-/// where right may be left times a core. Vectors have three numbers a point; those of five points are padded
-/// to sixteen.
+/// where `right` may be `left` times a core. Vectors have three numbers a point; vectors of five points
+/// are padded to sixteen.
 struct StencilTerms {
-  int count = 4;                ///< of the points: four or five
-  int terms = 0;                ///< of the sum: at most three
-  const double* left[3] = {};   ///< [12] or [16]
-  const double* right[3] = {};  ///< likewise; without a core
-  const double* core =
-      nullptr;                ///< [3, 3], symmetric: right_k = sum_m core_km left_m; null for none
-  double along = 0.0;         ///< with four points
-  const double* c = nullptr;  ///< [4]
-  const double* rest = nullptr;      ///< [12, 12], with four points; null for none
-  const double* turn = nullptr;      ///< [3]: its cross product between both edges; null for none
-  double sign[2][kStencilPoints]{};  ///< how often a point counts in each edge
+  int count = 4;                 ///< number of points: four or five
+  int terms = 0;                 ///< number of outer products: at most three
+  const double* left[3] = {};    ///< [12] or [16]
+  const double* right[3] = {};   ///< likewise; without a core
+  const double* core = nullptr;  ///< [3, 3], symmetric: right_k = sum_m core_km left_m; null: none
+  double along = 0.0;            ///< with four points only
+  const double* c = nullptr;     ///< [4]
+  const double* rest = nullptr;  ///< [12, 12], with four points; null: none
+  const double* turn = nullptr;  ///< [3]: cross product between both edges; null: none
+  double sign[2][kStencilPoints]{};  ///< coefficient of each point in each edge
 };
 
-/// Add its blocks to a matrix on a pattern (see BlockPattern).
+/// Add the blocks of the matrix to a matrix on a pattern (see BlockPattern).
 ///
-/// Only sums and products, each rounded once, in one order: the same bits at every level.
+/// The kernel uses sums and products only, each rounded once, in one order: identical bits at every
+/// level.
 ///
-/// @param row    [count] of the points, each another one; negative where a point has none
-/// @param start  where the columns of the pattern start
-/// @param rows   of the pattern
+/// @param row    [count] distinct rows of the points; negative: no row
+/// @param start  column starts of the pattern
+/// @param rows   row indices of the pattern
 using AddStencil = void (*)(const StencilTerms& of,
                             const std::int32_t* row,
                             const std::int32_t* start,
@@ -47,7 +47,7 @@ using AddStencil = void (*)(const StencilTerms& of,
 
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// @throws std::invalid_argument  where this processor or build has none of that level
+/// @throws std::invalid_argument  if this processor or build does not support the level
 AddStencil stencil_kernel(KernelLevel level);
 
 }  // namespace diffcloth::linalg

@@ -1,4 +1,4 @@
-// The arithmetic of AddStencil, written once over vectors of `kRows` doubles. Everything here is in an anonymous
+// Kernel of AddStencil, written once over vectors of `kRows` doubles. Everything here is in an anonymous
 // namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
@@ -25,15 +25,16 @@ using Stored = double __attribute__((vector_size(8 * kRows), aligned(8), may_ali
 DIFFCLOTH_INLINE Pack load(const double* from) { return *reinterpret_cast<const Stored*>(from); }
 DIFFCLOTH_INLINE void store(double* to, const Pack& from) { *reinterpret_cast<Stored*>(to) = from; }
 
-/// Numbers 0 1 2 0 and 1 2 0 1 of a point, or 0 0 0 1 and 1 1 2 2 of another: their products are the first eight of
-/// a block, which its columns, one behind the other, make.
+/// Numbers 0 1 2 0 and 1 2 0 1 of one point, and 0 0 0 1 and 1 1 2 2 of another: their products are the
+/// first eight entries of the block, column by column.
 using Four = double __attribute__((vector_size(32)));
 using StoredFour = double __attribute__((vector_size(32), aligned(8), may_alias));
 struct Eight {
   Four v[2];
 };
 
-/// Three numbers that are followed, or preceded, by another one, in the order of rows or of columns.
+/// Load three numbers that are followed, or preceded, by another one, and arrange them in the order of
+/// rows or of columns.
 template <bool kPreceded>
 DIFFCLOTH_INLINE void spread(const double* from, bool rows, Eight& to) {
   const StoredFour& v = *reinterpret_cast<const StoredFour*>(kPreceded ? from - 1 : from);
@@ -47,14 +48,14 @@ DIFFCLOTH_INLINE void spread(const double* from, bool rows, Eight& to) {
   }
 }
 
-/// kSize numbers a vector, of kPoints points.
+/// Kernel for kPoints points, with vectors of kSize numbers.
 template <int kPoints, int kSize>
 DIFFCLOTH_INLINE void add(const StencilTerms& of,
                           const std::int32_t* row,
                           const std::int32_t* start,
                           const std::int32_t* rows,
                           double* blocks) {
-  // A matrix is larger than the nearest cache: where its blocks are is told early.
+  // The matrix exceeds the first-level cache: prefetch its blocks early.
   double* to_block[kPoints][kPoints] = {};
 #pragma GCC unroll 5
   for (int p = 0; p < kPoints; ++p) {
@@ -63,7 +64,7 @@ DIFFCLOTH_INLINE void add(const StencilTerms& of,
       if (row[p] < 0 || row[q] < 0) continue;
       const std::int32_t i = row[p] > row[q] ? row[p] : row[q];
       const std::int32_t j = row[p] > row[q] ? row[q] : row[p];
-      // A column begins on the diagonal.
+      // The diagonal block is the first of its column.
       double* const block = blocks + 9 * (p == q ? start[j] : slot_of(start, rows, i, j));
       to_block[p][q] = block;
       __builtin_prefetch(block);
@@ -100,7 +101,7 @@ DIFFCLOTH_INLINE void add(const StencilTerms& of,
 #pragma GCC unroll 5
     for (int q = 0; q <= p; ++q) {
       if (row[p] < 0 || row[q] < 0) continue;
-      // Which of both is the row is as good as random, so that there are no branches.
+      // The order of the two rows is unpredictable, hence no branches.
       const bool is_lower = row[p] >= row[q];
       const int r = is_lower ? p : q;
       const int c = is_lower ? q : p;

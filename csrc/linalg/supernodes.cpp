@@ -5,38 +5,37 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// A supernode while supernodes are merged.
+/// A supernode during merging.
 struct Node {
   Index columns;  ///< vertices
   Index rows;     ///< vertices below
-  double zeros;   ///< blocks of its panel that are zero for want of structure
+  double zeros;   ///< structurally zero blocks of its panel
   Index parent;
-  Index merged_into;  ///< -1, or the parent that has its columns now
+  Index merged_into;  ///< -1, or the parent that now contains its columns
 };
 
 double panel_blocks(Index columns, Index rows) {
   return 0.5 * columns * (columns + 1.0) + static_cast<double>(columns) * rows;
 }
 
-/// Whether a panel of so many columns may have this share of zeros.
+/// True if a panel with this many columns may have this fraction of zeros.
 bool few_zeros(Index columns, double share) {
   const Index scalars = 3 * columns;
   return (scalars <= 16 && share < 0.8) || (scalars <= 48 && share < 0.1) || share < 0.05;
 }
 
-/// Operations that eliminate a front of so many vertices.
+/// Operations to eliminate a front of this size, in vertices.
 double operations(Index columns, Index rows) {
   const auto c = static_cast<double>(columns);
   const auto r = static_cast<double>(rows);
   return 27.0 * c * (c * c / 3.0 + c * r + r * r);
 }
 
-/// Operations that take as long as the kernels of a front need to begin, and as one entry needs that is added to a
-/// parent.
+/// Costs in operations: start of the kernels of a front, and addition of one entry to a parent.
 constexpr double kFront = 2e4;
 constexpr double kMoved = 20.0;
 
-/// Whether a child costs less as a part of its parent than as a front of its own.
+/// True if a child costs less as a part of its parent than as a separate front.
 bool is_cheaper_together(const Node& child, const Node& parent) {
   const double apart =
       operations(child.columns, child.rows) + operations(parent.columns, parent.rows);
@@ -45,7 +44,7 @@ bool is_cheaper_together(const Node& child, const Node& parent) {
   return together - apart < kFront + kMoved * moved;
 }
 
-/// Supernodes of columns that have the same structure below them; owner[k] is that of column k.
+/// Supernodes of columns with the same structure below; owner[k] is the supernode of column k.
 std::vector<Node> fundamental(const EliminationTree& tree, std::vector<Index>& owner) {
   const auto n = static_cast<Index>(tree.order.size());
   std::vector<Node> nodes;
@@ -67,13 +66,13 @@ std::vector<Node> fundamental(const EliminationTree& tree, std::vector<Index>& o
   return nodes;
 }
 
-/// Zeros of the panel that a child and its parent would share.
+/// Zeros of the panel of a child merged with its parent.
 double zeros_together(const Node& child, const Node& parent) {
   return child.zeros + parent.zeros +
          static_cast<double>(child.columns) * (parent.columns + parent.rows - child.rows);
 }
 
-/// Merge children into their parents, from the leaves up, first those that add the fewest zeros.
+/// Merge children into their parents, from the leaves up, children that add the fewest zeros first.
 void merge_children(std::vector<Node>& nodes) {
   const auto count = static_cast<Index>(nodes.size());
   std::vector<std::vector<Index>> children(count);
@@ -105,13 +104,13 @@ SupernodeTree gather_supernodes(const EliminationTree& tree) {
   std::vector<Node> nodes = fundamental(tree, owner);
   merge_children(nodes);
 
-  // Parents come after their children: roots of merged groups are known from the end on.
+  // Parents follow their children: roots of merged groups are found backwards.
   const auto count = static_cast<Index>(nodes.size());
   std::vector<Index> group(count);
   for (Index s = count - 1; s >= 0; --s) {
     group[s] = nodes[s].merged_into == -1 ? s : group[nodes[s].merged_into];
   }
-  // The groups in the order of their last members are in postorder still.
+  // Groups in the order of their last members are still in postorder.
   SupernodeTree result;
   std::vector<Index> place(count, -1);
   result.start.push_back(0);

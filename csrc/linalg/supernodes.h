@@ -15,8 +15,8 @@ struct SupernodeTree {
   Index size() const { return static_cast<Index>(parent.size()); }
 };
 
-/// Gather columns of equal structure, then merge children into parents where that stores few zeros:
-/// larger panels cost less for each entry.
+/// Gather columns of equal structure, then merge children into parents if few zeros result: larger
+/// panels cost less per entry.
 SupernodeTree gather_supernodes(const EliminationTree& tree);
 
 }  // namespace diffcloth::linalg

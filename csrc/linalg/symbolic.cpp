@@ -9,19 +9,20 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// Factorizations of fewer operations are one task; larger ones are split into subtrees of at most
-/// this share of the operations, and what is above these.
+/// Factorizations with fewer operations are one task; larger ones are split into subtrees of at most
+/// this fraction of the operations, and the supernodes above.
 constexpr double kWorthSplitting = 2e8;
 constexpr double kLargestShare = 1.0 / 64;
 
-/// Columns that are longer lie an odd number of cache lines apart, in different sets of the cache.
+/// Minimum length of columns whose stride is an odd number of cache lines, so that they map to different
+/// cache sets.
 constexpr Index kLongColumn = 128;
 
 std::size_t size(const Trapezoid& matrix, Index columns) {
   return static_cast<std::size_t>(matrix.size(columns));
 }
 
-/// Operations that a supernode takes.
+/// Operations of the elimination of a supernode.
 double front_flops(const Front& front) {
   double flops = 0.0;
   for (Index j = 0; j < front.columns; ++j) {
@@ -31,7 +32,7 @@ double front_flops(const Front& front) {
   return flops;
 }
 
-/// Builds a Symbolic, one aspect after the other.
+/// Builds a Symbolic step by step.
 class Analyzer {
  public:
   Analyzer(const BlockPattern& pattern,
@@ -104,7 +105,7 @@ class Analyzer {
     }
   }
 
-  /// Rows below a supernode: those of A's columns and of its children.
+  /// Rows below a supernode: rows of A's columns and of its children.
   void find_rows() {
     std::vector<Index> seen(graph_.size(), -1);
     for (Index s = 0; s < gathered_.size(); ++s) {
@@ -149,7 +150,7 @@ class Analyzer {
     }
   }
 
-  /// Slots by supernode: counted, then filled in.
+  /// Bucket sort of the slots by supernode.
   void sort_blocks() {
     std::vector<std::size_t> start(s_.supernodes.size() + 1, 0);
     const auto for_each_block = [&](auto visit) {
@@ -179,7 +180,7 @@ class Analyzer {
     });
   }
 
-  /// Where blocks of the matrix and update matrices of children fall in each supernode.
+  /// Locate blocks of the matrix and update matrices of children in each supernode.
   void map_into_panels() {
     std::vector<Index> position(graph_.size());  // among a supernode's columns, then its rows
     for (const Supernode& node : s_.supernodes) {
@@ -233,15 +234,15 @@ class Analyzer {
     return flops;
   }
 
-  /// A task ends at the root of a subtree that is small enough where that of its parent is not. Trees
-  /// of their own share one while they are small.
+  /// A task ends at the root of a subtree that is small enough while the parent's subtree is not.
+  /// Separate trees share a task while they are small.
   void split() {
     const auto count = static_cast<Index>(s_.supernodes.size());
     const std::vector<double> flops = subtree_flops();
     const double largest = s_.flops < kWorthSplitting ? std::numeric_limits<double>::infinity()
                                                       : kLargestShare * s_.flops;
     const auto joins = [&](Index s) { return flops[s] > largest; };
-    double trees = 0.0;  // operations of those in the task so far
+    double trees = 0.0;  // operations of the whole trees in the current task
     for (Index s = 0, begin = 0; s < count; ++s) {
       Supernode& node = s_.supernodes[s];
       node.task = static_cast<Index>(s_.tasks.size());
@@ -266,9 +267,9 @@ class Analyzer {
     }
   }
 
-  /// In each task first fit at each supernode's turn, while what is left of the matrices of its
-  /// children is alive. From the end of the arena on, as it is the last columns of a matrix that are
-  /// left. What the root leaves has a place elsewhere.
+  /// First fit within each task, in the order of elimination, among the matrices of children that are
+  /// alive. Offsets count from the end of the arena, because the last columns of a matrix stay alive
+  /// longest. The update matrix of the root is stored elsewhere.
   void lay_out_arenas() {
     struct Extent {
       std::size_t begin, end;  // counted from the end of the arena
@@ -287,7 +288,7 @@ class Analyzer {
         node.update = begin + wanted;
         s_.arena_size = std::max(s_.arena_size, node.update);
         if (node.parent != -1 && !is_left) {
-          // Its first columns are in its parent's panel before the next supernode's turn.
+          // Its first columns are added to its parent's panel before the next supernode is eliminated.
           alive.insert(gap,
                        {.begin = begin, .end = node.update - s_.taken_size(node), .supernode = s});
         }
@@ -302,7 +303,7 @@ class Analyzer {
   const EliminationTree& tree_;
   Index lanes_;
   SupernodeTree gathered_;
-  std::vector<Index> rank_;   // [pattern.size()] place in the order of elimination, -1 if fixed
+  std::vector<Index> rank_;   // [pattern.size()] rank in the order of elimination, -1 if fixed
   std::vector<Index> owner_;  // [n] supernode of a column
   Symbolic s_;
 };

@@ -7,16 +7,16 @@
 
 namespace diffcloth {
 
-/// What potentials have accumulated for one loss, set aside while another loss has its turn.
+/// Cotangents that potentials accumulated for one loss, stored while another loss is processed.
 ///
-/// Each time the same potentials come by in the same order, and swap what they have with what is here:
-/// zero, the first time.
+/// In each round the same potentials swap their cotangents with the stored ones in the same order; the
+/// first stored ones are zero.
 class CotangentStore {
  public:
   /// Begin a round of swaps.
   void begin() { next_ = 0; }
 
-  /// @param bar  of any type that can be copied; zero where it comes by for the first time
+  /// @param bar  of any copyable type; must be zero in the first round
   template <class T>
   void exchange(T& bar) {
     if (next_ == bars_.size()) bars_.emplace_back(bar);

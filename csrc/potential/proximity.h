@@ -6,9 +6,9 @@
 
 namespace diffcloth {
 
-/// Nearness to a target in a diagonal metric:  P = 1/(2 h^2) (x - y)^T G (x - y).
+/// Quadratic distance to a target in a diagonal metric:  P = 1/(2 h^2) (x - y)^T G (x - y).
 ///
-/// With G the lumped masses and y the inertial prediction it is the potential of implicit Euler.
+/// With G the lumped masses and y the inertial prediction it is the inertia potential of implicit Euler.
 class Proximity final : public Potential {
  public:
   /// @param metric  G_i [kg], one a cloth vertex

@@ -6,12 +6,12 @@
 
 namespace diffcloth {
 
-/// Another potential at points less a shift:  P(x - d).
+/// Another potential at shifted points:  P(x - d).
 ///
-/// Inputs and cotangents of P stay P's own, whose owner swaps them.
+/// Inputs and cotangents of P remain with P; its owner swaps the cotangents.
 class Shifted final : public Potential {
  public:
-  /// @param potential  P; outlives this
+  /// @param potential  P; must outlive this object
   /// @param shift      d, all points [m]; likewise
   Shifted(Potential& potential, const std::vector<double>& shift);
 
@@ -55,7 +55,7 @@ class Shifted final : public Potential {
   std::vector<double> shift_dot;  ///< likewise, for add_tangent(); empty: zero
 
  private:
-  /// x - d, which lasts until the next call.
+  /// x - d; valid until the next call.
   const double* less(const double* x) const;
 
   Potential& potential_;

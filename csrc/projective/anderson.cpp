@@ -8,11 +8,11 @@
 namespace diffcloth::projective {
 namespace {
 
-/// Changes that are combinations of others up to this share tell nothing new.
+/// Relative tolerance below which a change counts as a linear combination of others.
 constexpr double kDependent = 1e-12;
 
 double dot(const std::vector<double>& a, const double* b) {
-  // Four sums, so that one addition need not wait for the last.
+  // Four independent sums, so that additions do not wait for each other.
   const std::size_t n = a.size();
   std::array<double, 4> sum{};
   std::size_t k = 0;
@@ -46,7 +46,7 @@ void Anderson::next(const double* x, const double* p, const double* q, double* t
       change.p[a] = p[a] - last_p_[a];
       change.q[a] = q[a] - last_q_[a];
     }
-    // Until the ring is full its first places are in use.
+    // Until the ring is full, its first slots are in use.
     for (int k = 0; k < count_; ++k) {
       products_(k, newest_) = products_(newest_, k) = dot(changes_[k].p, change.q.data());
     }

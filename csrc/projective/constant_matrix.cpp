@@ -12,7 +12,7 @@ namespace {
 
 using Sparse = Eigen::SparseMatrix<double, Eigen::ColMajor, Index>;
 
-/// Rank of each free vertex in an order of little fill; -1 at the others.
+/// Rank of each free vertex in a fill-reducing order; -1 for other vertices.
 std::vector<Index> elimination_order(const linalg::BlockPattern& pattern,
                                      const std::vector<char>& fixed) {
   const auto n = static_cast<Index>(fixed.size());
@@ -82,7 +82,7 @@ ConstantMatrix::ConstantMatrix(std::shared_ptr<const ConstantAnalysis> analysis,
   for (std::size_t k = 0; k < entries.size(); ++k) entries[k] = values_[a.slot[k]];
   const Eigen::Map<const Sparse> lower(n, n, static_cast<Index>(entries.size()),
                                        a.column_start.data(), a.row.data(), entries.data());
-  // The rows are in the order of elimination already.
+  // The rows are already in the order of elimination.
   Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>> cholesky;
   cholesky.compute(lower);
   if (cholesky.info() != Eigen::Success) {
@@ -105,7 +105,7 @@ ConstantMatrix::ConstantMatrix(std::shared_ptr<const ConstantAnalysis> analysis,
   }
 }
 
-// The three axes go together, padded to four numbers a row.
+// The three axes are processed together, padded to four numbers a row.
 void ConstantMatrix::solve(const double* b, double* x, Scratch& y) const {
   const std::vector<Index>& vertex = analysis_->vertex;
   const auto n = static_cast<Index>(vertex.size());

@@ -11,15 +11,15 @@
 
 namespace diffcloth::projective {
 
-/// Which vertices are unknowns of Projective Dynamics, in the order of their elimination, and where
-/// the entries of its matrix go: all that does not depend on the values.
+/// Unknown vertices of Projective Dynamics, in the order of elimination, and the pattern of its matrix:
+/// all data that does not depend on values.
 struct ConstantAnalysis {
-  /// @param pattern  of the values that matrices are made from; rows beyond the vertices are left out
+  /// @param pattern  of the matrices' values; rows beyond the vertices are left out
   /// @param fixed    [N] pins: eliminated
   ConstantAnalysis(const linalg::BlockPattern& pattern, const std::vector<char>& fixed);
 
   Index vertex_count;         ///< N
-  std::vector<Index> vertex;  ///< of each row
+  std::vector<Index> vertex;  ///< [rows] vertex of each row
 
   // The lower triangle in compressed columns, the diagonal first, and the slot of each entry.
   std::vector<Index> column_start;
@@ -34,7 +34,7 @@ class ConstantMatrix {
   using Scratch = std::vector<Vec4>;
 
   /// @param values  of A, one a slot of the analysis' pattern [N/m]
-  /// @throws std::domain_error where A is not positive definite in float64
+  /// @throws std::domain_error  if A is not positive definite in float64
   ConstantMatrix(std::shared_ptr<const ConstantAnalysis> analysis, std::vector<double> values);
 
   const std::vector<double>& values() const { return values_; }
@@ -42,10 +42,10 @@ class ConstantMatrix {
   /// The free vertices.
   const std::vector<Index>& vertices() const { return analysis_->vertex; }
 
-  /// x = A^-1 b, [N, 3]; zero at pins. b and x may be one array.
+  /// x = A^-1 b, [N, 3]; zero at pins. b and x may alias.
   void solve(const double* b, double* x, Scratch& scratch) const;
 
-  /// What it takes up.
+  /// Memory of the matrix and its factor [bytes].
   std::size_t bytes() const;
 
  private:
@@ -59,13 +59,13 @@ class ConstantMatrix {
   std::vector<double> inverse_diagonal_;
 };
 
-/// Constant matrices seen before, by their values.
+/// Cache of constant matrices, by their values.
 ///
-/// Only a memory, bounded in bytes: a matrix is a function of its values, so results do not depend on
-/// what is in it. Any thread may ask.
+/// Bounded in bytes. A matrix is a function of its values, so the content of the cache does not affect
+/// results. Thread-safe.
 class ConstantMatrixCache {
  public:
-  /// See ConstantAnalysis. The pattern outlives the cache.
+  /// See ConstantAnalysis. The pattern must outlive the cache.
   ConstantMatrixCache(const linalg::BlockPattern& pattern, std::vector<char> fixed);
   ConstantMatrixCache(const ConstantMatrixCache&) = delete;
   ConstantMatrixCache& operator=(const ConstantMatrixCache&) = delete;
@@ -78,7 +78,7 @@ class ConstantMatrixCache {
   const linalg::BlockPattern& pattern_;
   std::vector<char> fixed_;
   std::mutex mutex_;
-  std::shared_ptr<const ConstantAnalysis> analysis_;           // made when first needed
+  std::shared_ptr<const ConstantAnalysis> analysis_;           // created when first needed
   std::list<std::shared_ptr<const ConstantMatrix>> matrices_;  // most recent first
   std::size_t bytes_ = 0;
 };

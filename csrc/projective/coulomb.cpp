@@ -5,7 +5,8 @@
 namespace diffcloth::projective {
 namespace {
 
-/// Largest ratio: a slip this slow is as stiff as sticking, and a factor can still resolve the rest.
+/// Bound of the ratio: such slow slip is as stiff as sticking, and a factor can still resolve the other
+/// entries.
 constexpr double kLargestRatio = 1e8;
 
 }  // namespace

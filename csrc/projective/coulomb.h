@@ -9,9 +9,9 @@ namespace diffcloth::projective {
 /// The three cases of the law of Signorini and Coulomb (the paper's Eq. 3).
 enum class ContactCase : std::uint8_t { kTakingOff, kSticking, kSlipping };
 
-/// The law at one contact: what the impulse r must be where s = r - m u, with the relative velocity u
-/// and a mass m > 0. Impulse and velocity obey the law exactly where r = impulse(r - m u): s and not r
-/// decides on the case.
+/// The law at one contact: the impulse r as a function of s = r - m u, with the relative velocity u and
+/// a mass m > 0. Impulse and velocity obey the law exactly if r = impulse(r - m u): the case depends on
+/// s, not on r.
 ///
 ///   taking off   s_n <= 0              r = 0
 ///   sticking     |s_T| <= mu s_n       r = s                        hence u = 0
@@ -19,9 +19,9 @@ enum class ContactCase : std::uint8_t { kTakingOff, kSticking, kSlipping };
 struct Coulomb {
   ContactCase kind = ContactCase::kTakingOff;
   Vec3 impulse = Vec3::Zero();    ///< [N s]
-  Vec3 direction = Vec3::Zero();  ///< t of slipping
-  /// Of slipping: mu s_n / (|s_T| - mu s_n). Across the slip, friction turns with the velocity like a
-  /// damper of this many masses: dr = -ratio m du.
+  Vec3 direction = Vec3::Zero();  ///< t, if slipping
+  /// If slipping: mu s_n / (|s_T| - mu s_n). Orthogonal to the slip, friction responds to the velocity
+  /// like a damper: dr = -ratio m du.
   double ratio = 0.0;
 };
 

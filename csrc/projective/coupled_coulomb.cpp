@@ -16,8 +16,8 @@ using solver::stopping::kCoupledCoulomb;
 
 namespace {
 
-/// The velocities of a contact that slips, by the direction of friction. With t = cos(a) t_1 + sin(a)
-/// t_2 and r = r_n (n + mu t), where r_n keeps n . u at zero.
+/// Velocity of a slipping contact as a function of the direction of friction: t = cos(a) t_1 + sin(a)
+/// t_2, and r = r_n (n + mu t) with r_n such that n . u = 0.
 class Slip {
  public:
   Slip(const Mat3& A, const Vec3& b, const RoughPlane& plane, const Vec3& last)
@@ -32,8 +32,8 @@ class Slip {
 
   struct At {
     Vec3 r;
-    double across;  ///< of u across t; infinite where no impulse keeps n . u at zero
-    double along;   ///< of u along t: negative where friction brakes
+    double across;  ///< component of u across t; infinite if no impulse keeps n . u at zero
+    double along;   ///< component of u along t: negative if friction brakes
   };
 
   At at(double angle) const {
@@ -46,7 +46,7 @@ class Slip {
     return {.r = r, .across = plane_.normal.cross(t).dot(u), .along = t.dot(u)};
   }
 
-  /// The root between two angles at which u has different sides.
+  /// Root between two angles at which the component across t has opposite signs.
   At refine(double a, At at_a, double b, At at_b) const {
     double weight_a = 1.0;
     double weight_b = 1.0;
@@ -62,7 +62,7 @@ class Slip {
       const At at_c = at(c);
       if (!std::isfinite(at_c.across)) break;
       if (std::abs(at_c.across) < std::abs(best.across)) best = at_c;
-      // Illinois: the end that stays counts half.
+      // Illinois method: halve the weight of the end that is retained.
       if ((at_c.across < 0.0) == (at_a.across < 0.0)) {
         a = c;
         at_a = at_c;
@@ -81,7 +81,7 @@ class Slip {
   }
 
   Vec3 solve() const {
-    // From the last direction to both sides.
+    // Search from the last direction to both sides.
     constexpr double kStep = 2.0 * std::numbers::pi / kCoupledCoulomb.directions;
     At best{.r = Vec3::Zero(), .across = INFINITY, .along = INFINITY};
     At left = at(0.0);
@@ -109,7 +109,7 @@ class Slip {
   Vec3 t_1_, t_2_;
 };
 
-/// The law of all contacts as equations  r = Phi(r - m u), u = q + W r, see coulomb.h.
+/// The law at all contacts as equations  r = Phi(r - m u), u = q + W r, see coulomb.h.
 class Equations {
  public:
   Equations(const Eigen::MatrixXd& W,
@@ -117,7 +117,7 @@ class Equations {
             const std::vector<RoughPlane>& planes)
       : W_(W), q_(q), planes_(planes) {}
 
-  /// Newton's steps while they contract what is left of the equations.
+  /// Newton steps, as long as they contract the residual.
   void polish(Eigen::VectorXd& r) const {
     Eigen::VectorXd left = residual(r);
     for (int k = 0; k < kCoupledCoulomb.newton_steps; ++k) {
@@ -130,7 +130,7 @@ class Equations {
   }
 
  private:
-  /// A mass of a contact, of the size of that which it meets [kg].
+  /// Mass scale of a contact: the inverse of its mean compliance [kg].
   double mass(Eigen::Index k) const { return 3.0 / W_.block<3, 3>(3 * k, 3 * k).trace(); }
 
   /// r - m u of a contact.
@@ -177,7 +177,7 @@ class Equations {
         break;
     }
     const Vec3& t = at.direction;
-    // dr = turn ds across the slip; with ratio = limit / (|s_T| - limit), turn = limit / |s_T|.
+    // dr = turn ds orthogonal to the slip; with ratio = limit / (|s_T| - limit), turn = limit / |s_T|.
     const double turn = at.ratio / (1.0 + at.ratio);
     const Mat3 across = Mat3::Identity() - n * n.transpose() - t * t.transpose();
     return (n + friction * t) * n.transpose() + turn * across;
@@ -213,7 +213,7 @@ bool solve_coulomb(const Eigen::MatrixXd& W,
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
     if (sweep > 0 && sweep % kCoupledCoulomb.sweeps_per_share == 0)
       share = std::max(kCoupledCoulomb.least_share, 0.5 * share);
-    double change = 0.0;  // of this sweep, and of all
+    double change = 0.0;  // in this sweep; `moved`: since the start
     double moved = 0.0;
     double size = 0.0;
     for (Eigen::Index k = 0; k < m; ++k) {

@@ -13,7 +13,7 @@ using solver::stopping::kLocalGlobal;
 
 namespace {
 
-/// The iterate, the gradient there and the next step. What is allocated is so once.
+/// Iterate, its gradient and the next step. All memory is allocated once.
 class Iteration {
  public:
   Iteration(const LocalGlobalObjective& objective, std::vector<double>& x)
@@ -29,10 +29,10 @@ class Iteration {
     look();
   }
 
-  /// max_i h |g_i| / m_i [m/s]; infinite where the gradient is not finite.
+  /// max_i h |g_i| / m_i [m/s]; infinite if the gradient is not finite.
   double residual() const { return residual_; }
 
-  /// Go to the next iterate; false where no step has an effect and does not raise the energy.
+  /// Compute the next iterate. Returns false if no step has an effect without raising the energy.
   bool advance() {
     f_.matrix->solve(g_.data(), p_.data(), scratch_);
     double step = 0.0;
@@ -51,7 +51,7 @@ class Iteration {
     return true;
   }
 
-  /// Go back to the iterate before.
+  /// Restore the previous iterate.
   void go_back() {
     x_.swap(to_);
     look();
@@ -64,7 +64,7 @@ class Iteration {
     return change_ < 0.0 || (change_ <= noise_ && is_flat());
   }
 
-  /// Whether the way to `to` goes down, and ends where it is flatter.
+  /// True if the step to `to` descends, and ends at a point with a smaller slope.
   bool is_flat() {
     f_.gradient(to_, g_to_);
     double slope = 0.0;
@@ -89,7 +89,7 @@ class Iteration {
     return idle_ > kLocalGlobal.idle_iterations;
   }
 
-  /// Take the plain step, or a part of it.
+  /// Use the plain step, halved as often as necessary.
   bool halve() {
     double share = 1.0;
     for (int k = 0; k < kLocalGlobal.halvings; ++k, share *= 0.5) {
@@ -111,8 +111,8 @@ class Iteration {
   Anderson anderson_;
   ConstantMatrix::Scratch scratch_;
   double residual_ = 0.0;
-  double change_ = -std::numeric_limits<double>::infinity();  // of the last step [J]
-  double noise_ = 0.0;                                        // what rounding can fake of it
+  double change_ = -std::numeric_limits<double>::infinity();  // change of energy, last step [J]
+  double noise_ = 0.0;  // bound of change_ due to rounding [J]
   double best_ = std::numeric_limits<double>::infinity();
   int age_ = 0;
   int idle_ = 0;

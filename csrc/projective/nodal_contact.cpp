@@ -13,7 +13,7 @@
 
 namespace diffcloth::projective {
 
-/// Points by the cells of a grid.
+/// Hash grid of points.
 class Cells {
  public:
   explicit Cells(double size) : size_(size) {}
@@ -21,7 +21,7 @@ class Cells {
   double size() const { return size_; }
   void add(const Vec3& x, Index point) { cells_[key(cell(x))].push_back(point); }
 
-  /// Call visit(j) for every point in the cells around x: those within `size`, and some others. One
+  /// Call visit(j) for every point in the cells around x: includes all within `size`, and others. A
   /// point may be visited more than once.
   template <class Visit>
   void around(const Vec3& x, Visit&& visit) const {
@@ -42,7 +42,7 @@ class Cells {
 
   Cell cell(const Vec3& x) const {
     Cell c{};
-    // Bounded, so that a cast of far points is defined; they only share cells.
+    // Clamped, so that casts of distant points are defined; these merely share cells.
     constexpr double kFar = 1e15;
     for (int k = 0; k < 3; ++k) {
       c[k] = static_cast<std::int64_t>(std::floor(std::clamp(x[k] / size_, -kFar, kFar)));
@@ -66,8 +66,8 @@ using bodies::Pose;
 
 constexpr std::array<double, 3> kFractions{0.0, 0.5, 1.0};
 
-/// Half of the way between two poses. The quaternion of slerp has the direction of the sum of the unit
-/// quaternions, taken on one side; its length does not matter.
+/// Pose midway between two poses. The quaternion of slerp has the direction of the sum of the unit
+/// quaternions, with signs aligned; its length is irrelevant.
 struct Halfway {
   Vec4 a, b;  ///< unit quaternions
   double side;
@@ -103,7 +103,7 @@ void pull_back_pose(const Obstacle& o, double fraction, const Pose& bar, FrameBa
   }
 }
 
-/// Change of the pose at a fraction with those at both ends.
+/// Change of the pose at a fraction with the poses at both ends.
 Pose push_forward_pose(const Obstacle& o, double fraction, const FrameBar& dot) {
   if (fraction == 0.0) return dot.start;
   if (fraction == 1.0) return dot.end;
@@ -125,10 +125,10 @@ Mat3 turn_jvp(const Pose& pose, Pose change) {
   return columns;
 }
 
-/// Place of a point of a body's frame.
+/// World position of a point in a body's frame.
 Vec3 placed(const Pose& pose, const Vec3& y) { return pose.head<3>() + bodies::rotation(pose) * y; }
 
-/// What turning a pose does to z . R y, as a cotangent of the pose.
+/// Cotangent of the pose for z . R y.
 Pose turn_vjp(const Pose& pose, const Vec3& y, const Vec3& z) {
   Pose bar = bodies::transform_vjp(pose, y.data(), 1, z.data());
   bar.head<3>().setZero();
@@ -276,7 +276,7 @@ FrameBar pull_back(const NodalContact& contact,
   const Vec3 y_bar = near.normal_derivative * (R.transpose() * normal_bar) +
                      near.surface_point_derivative() * b_bar;
   out.vertex = R * y_bar;
-  // y_bar . R^T (x - p) is also (R y_bar) . (x - p).
+  // y_bar . R^T (x - p) equals (R y_bar) . (x - p).
   Pose pose_bar = turn_vjp(pose, near.normal, normal_bar) + turn_vjp(pose, y_bar, from_origin);
   pose_bar.head<3>() -= out.vertex;
   pull_back_pose(o, contact.fraction, pose_bar, out);
@@ -343,7 +343,8 @@ FaceSearch::Share FaceSearch::share(const Vec3& y) const {
   Index best = -1;
   contact::Closest closest{};
   const auto find = [&] {
-    // No face is farther than its center, nor nearer than that less the radius.
+    // The distance to a face is between the distance to its center minus the radius and the distance to
+    // its center.
     double reach = std::numeric_limits<double>::infinity();
     for (const Near& n : near) reach = std::min(reach, n.center_sq);
     reach = std::sqrt(reach) + radius_;
@@ -353,7 +354,7 @@ FaceSearch::Share FaceSearch::share(const Vec3& y) const {
       const auto& [a, b, c] = corners_[f];
       const contact::Closest found =
           contact::closest(contact::PairKind::kPointTriangle, {y, a, b, c});
-      // The first of equals, in whatever order they are looked at.
+      // Among equal distances the lowest index, independent of the order of the search.
       if (best < 0 || found.d_sq < closest.d_sq || (found.d_sq == closest.d_sq && f < best)) {
         closest = found;
         best = f;

@@ -8,8 +8,8 @@
 namespace diffcloth::projective {
 namespace {
 
-/// Distance to a set of points whose nearest one to y is y - w, less a radius. A change of y moves
-/// w by `moves` of it.
+/// Distance to a set of points, minus a radius, where y - w is the nearest point of the set to y.
+/// `moves` is the derivative of w by y.
 Nearest around(const Vec3& w, const Mat3& moves, double radius, const Vec3& fallback) {
   const double length = w.norm();
   if (!(length > 0.0)) {

@@ -34,7 +34,7 @@ std::vector<std::vector<Index>> cliques(const std::vector<std::array<Index, 3>>&
   return result;
 }
 
-/// Drag of faces over one step, which a test varies by making others.
+/// Drag of faces over one step; a test creates one for each set of inputs.
 class FaceDrag {
  public:
   FaceDrag(const Faces& faces,

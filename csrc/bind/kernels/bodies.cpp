@@ -63,8 +63,8 @@ nb::object free_turns(const Doubles& inertia, const Doubles& momentum, double ti
   return nb::make_tuple(turn.array, rate.array, found.array);
 }
 
-/// Of w and a moment: the quaternion of w, its logarithm, its matrix, and the torque, 19 numbers; and
-/// their derivatives by the six that are given, [19, 6].
+/// For w and a moment: the quaternion of w, its logarithm, its matrix, and the torque, 19 numbers; and
+/// their derivatives by the six inputs, [19, 6].
 nb::object rotations(const Vec3& w, const Vec3& moment) {
   Recording recording;
   const Recorder recorder(recording);

@@ -22,10 +22,10 @@ using Clock = std::chrono::steady_clock;
 
 void rest() { std::this_thread::sleep_for(std::chrono::milliseconds(1)); }
 
-/// Runs `count` bodies and returns how many of them each thread took, the caller's first.
+/// Run `count` bodies, and return how many of them each thread executed, the caller's first.
 ///
-/// Bodies on the caller's thread return once another thread has begun, those on others go on for
-/// `seconds`, unless they are interrupted; `failing` ones then throw.
+/// Bodies on the caller's thread return once another thread has begun. Bodies on other threads continue
+/// for `seconds`, unless they are interrupted; `failing` ones then throw.
 std::vector<int> run_environments(int count,
                                   int threads,
                                   double seconds,
@@ -62,9 +62,9 @@ std::vector<int> run_environments(int count,
   return counts;
 }
 
-/// Works as a team does them: which member did each, and in which order they began.
+/// Run works on a team, and return the member that executed each, and the order in which they began.
 ///
-/// @param before  for each work those that it waits for, of lower indices
+/// @param before  for each work the lower indices it waits for
 std::vector<std::pair<int, int>> run_team(const std::vector<std::vector<int>>& before,
                                           int threads,
                                           double seconds,
@@ -81,7 +81,7 @@ std::vector<std::pair<int, int>> run_team(const std::vector<std::vector<int>>& b
     };
     const auto body = [&](Index i, int member) {
       taken[i] = {member, begun.fetch_add(1)};
-      // Not atomic: that what comes before has ended must be known from the team alone.
+      // Deliberately not atomic: the team must establish the order of memory between dependent works.
       for (const int other : before[i]) early = early || ended[other] == 0;
       const auto end = Clock::now() + std::chrono::duration<double>(seconds);
       while (Clock::now() < end) rest();
@@ -96,7 +96,7 @@ std::vector<std::pair<int, int>> run_team(const std::vector<std::vector<int>>& b
   return taken;
 }
 
-/// The order in which so many bodies of these costs begin; `failing` ones throw.
+/// Order in which bodies of these costs begin; `failing` ones throw.
 std::vector<int> order_of_environments(std::size_t count,
                                        int threads,
                                        const std::vector<double>& costs,

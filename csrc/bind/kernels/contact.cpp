@@ -93,7 +93,7 @@ void check_rows(const char* name, const Positions& x, const contact::CollisionMe
                             .c_str());
 }
 
-/// A mesh, its search trees and the lists of earlier searches: what a solver keeps together.
+/// A mesh, its search trees and the lists of earlier searches, as a solver keeps them.
 class Search {
  public:
   Search(const Faces& faces,
@@ -123,14 +123,14 @@ class Search {
     return rows();
   }
 
-  /// Likewise, where nothing moves, without most of what only boxes bring near.
+  /// Same without motion, and without most pairs that are near by their boxes only.
   IndexRows find_at_rest(const Positions& x, const std::vector<double>& reach) {
     check_reach(reach);
     broad_phase_.find_at_rest(checked("x", x), reach, scratch_, candidates_);
     return rows();
   }
 
-  /// Likewise, from the list that is kept between searches.
+  /// Same from the list that is kept between searches.
   IndexRows find_kept(const Positions& x_t0,
                       const Positions& x_t1,
                       const std::vector<double>& reach) {
@@ -140,7 +140,7 @@ class Search {
     return rows();
   }
 
-  /// What is within reach and a margin at a point.
+  /// Pairs within reach and a margin at a point.
   IndexRows find_at(const Positions& x,
                     const std::vector<double>& reach,
                     double widened,
@@ -151,7 +151,7 @@ class Search {
     return rows();
   }
 
-  /// How far apart the pairs of the last find_kept() stay at least.
+  /// Lower bounds of the distances of the pairs of the last find_kept().
   Eigen::VectorXd apart() const {
     return Eigen::Map<const Eigen::VectorXd>(found_.apart.data(), found_.apart.size());
   }
@@ -279,7 +279,7 @@ void law_kernels(nb::module_& m) {
       "y"_a, "e"_a);
 }
 
-/// Which of the first four boxes are near which of the other four: bits.
+/// Bits of the nearby pairs among the first and the last four boxes.
 auto near_boxes(const std::string& level, const Boxes& boxes, double range) {
   std::array<contact::BoxGroup, 2> groups;
   for (int k = 0; k < 2 * contact::kBoxGroup; ++k) {

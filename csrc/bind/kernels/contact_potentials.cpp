@@ -42,7 +42,7 @@ Values to_values(const std::vector<double>& v) {
   return Eigen::Map<const Values>(v.data(), static_cast<Eigen::Index>(v.size()));
 }
 
-/// Lagged friction of a mesh, alone: for tests.
+/// Lagged friction of a mesh alone.
 class Friction {
  public:
   Friction(const contact::ContactModel& model,
@@ -61,7 +61,7 @@ class Friction {
   const linalg::BlockPattern& pattern() const { return pattern_; }
   Potential& between(const double* /*x*/, const double* /*to*/) { return potential_; }
 
-  /// After a step along p by alpha from x: whether there are duals, and the primal-dual Hessian.
+  /// After a step along p by alpha from x: true if there are duals, and the primal-dual Hessian.
   std::pair<bool, Eigen::MatrixXd> after(const Positions& x, const Positions& p, double alpha) {
     const Rows3 to = x + alpha * p;
     potential_.update_duals(x.data(), p.data(), alpha, to.data());
@@ -69,7 +69,7 @@ class Friction {
             dense_hessian(potential_, pattern_, to.data(), Curvature::kPrimalDual)};
   }
 
-  /// At x, where a motion to another point is expected: whether there are duals, and the primal-dual and
+  /// At x, with an expected motion to another point: true if there are duals, and the primal-dual and
   /// the positive Hessian.
   std::tuple<bool, Eigen::MatrixXd, Eigen::MatrixXd> expecting(const Positions& x,
                                                                const Positions& to) {
@@ -87,7 +87,7 @@ class Friction {
   contact::FrictionPotential potential_;
 };
 
-/// Barrier and lagged friction of a mesh, alone: for tests.
+/// Barrier and lagged friction of a mesh.
 class ContactPotential {
  public:
   ContactPotential(const FaceRows& faces,
@@ -116,7 +116,7 @@ class ContactPotential {
 
   Index candidate_count(const Positions& x) { return static_cast<Index>(candidates(x, x).size()); }
 
-  /// Entries that are comparable between x and another position.
+  /// Energies of corresponding pairs at x and at another position.
   std::pair<Values, Values> energies(const Positions& x, const Positions& other) {
     const std::vector<contact::Candidate> pairs = candidates(x, other);
     contact::Near at_x;
@@ -173,7 +173,7 @@ class ContactPotential {
     return result;
   }
 
-  /// How the gradients of barrier and friction change with tangents of what they depend on: transposes of
+  /// Change of the gradients of barrier and friction with tangents of their inputs: the transposes of
   /// the two above.
   Rows3 tangent(const Positions& x, const nb::dict& dot) {
     Rows3 y = Rows3::Zero(x.rows(), 3);
@@ -210,19 +210,19 @@ class ContactPotential {
     return barrier;
   }
 
-  /// Fraction of a motion that is free of collisions, found among pairs that are kept between calls.
+  /// Collision-free fraction of a motion, from the pairs that are kept between calls.
   double safe_fraction(const Positions& x, const Positions& to) {
     if (!barrier_) barrier_.emplace(model_, detection_, nullptr);
     barrier_->watch(x.data(), to.data());
     return barrier_->safe_fraction(x.data(), to.data());
   }
 
-  /// Friction with the contacts of x_lag, of what has moved since x_start.
+  /// Friction with the contacts of x_lag, for the displacement since x_start.
   std::unique_ptr<Friction> friction(const Positions& x_lag, const Positions& x_start) {
     return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_start, x_lag);
   }
 
-  /// A rest measure by its name, to be changed by differences.
+  /// Reference to a rest measure by its name, for finite differences.
   std::vector<double>& measure(const std::string& name) {
     if (name == "vertex_area") return rest_.vertex_area;
     if (name == "edge_area") return rest_.edge_area;
@@ -232,7 +232,7 @@ class ContactPotential {
     throw nb::value_error(("contact potential: no measure `" + name + "`").c_str());
   }
 
-  /// s_e and s_v of the bodies' edges and vertices, as a cloth sees them.
+  /// s_e and s_v of the bodies' edges and vertices against a cloth.
   std::pair<Values, Values> sharpness(Index cloth) const {
     Values edge(mesh_.edges.size() - mesh_.cloth_edge_count);
     Values vertex(mesh_.vertex_count - mesh_.cloth_vertex_count);
@@ -256,7 +256,7 @@ class ContactPotential {
     return result;
   }
 
-  /// Of the bodies: A_v of vertices, theta and A_e of edges, and the areas of surfaces.
+  /// For the bodies: A_v of vertices, theta and A_e of edges, and the areas of surfaces.
   std::tuple<Values, Values, Values, Values> body_areas() const {
     const contact::Bulge bulge = contact::bulge(mesh_, X_.data());
     const contact::FeatureAreas areas = contact::feature_areas(mesh_, X_.data(), bulge);
@@ -264,8 +264,7 @@ class ContactPotential {
             to_values(areas.surface)};
   }
 
-  /// Weights of a sum over features: of edges, of vertices, and whether a face counts; as a point sees
-  /// them whose motion is given, or not.
+  /// Weights of a sum over features (edges, vertices, faces) for a prescribed or a free point.
   std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights(
       bool prescribed_point) const {
     const contact::FeatureWeights::Features& w = weights_.features(prescribed_point);

@@ -22,7 +22,7 @@ constexpr std::size_t kLanes = contact::kDirectionLanes;
 
 using Rows = std::vector<double>;
 
-/// Contacts that are made of noise, as nothing but the arithmetic matters.
+/// Contacts made of noise, because only the arithmetic matters.
 struct Noise {
   FixedNoise next;
 
@@ -85,7 +85,8 @@ struct Noise {
   }
 };
 
-/// y after all kernels of one group of lanes, for directions [lanes, kPoints, 3] that lie side by side.
+/// Add the products of all kernels of one group of lanes to y, for interleaved directions [lanes,
+/// kPoints, 3].
 void apply(const contact::DirectionKernels& kernels,
            const Rows& z,
            const Rows& lag,
@@ -138,7 +139,7 @@ void apply(const contact::DirectionKernels& kernels,
   }
 }
 
-/// What the kernels of a level make of eight directions, [9, 3, 8]: side by side, or each alone.
+/// Result of the kernels of a level for eight directions, [9, 3, 8]: side by side, or each alone.
 nb::ndarray<nb::numpy, double> directions(const std::string& level, bool alone) {
   const contact::DirectionLevel& kernels = contact::direction_kernels(level_named(level));
   Noise noise;

@@ -91,7 +91,7 @@ std::vector<mesh::BendingModel> model_list(const std::string& name, std::size_t 
                               "'");
 }
 
-/// A rest mesh with its stencils and one elastic model on it: all that a test varies, in one place.
+/// A rest mesh with its stencils and one elastic model on it, with all inputs that a test varies.
 class Elastic {
  public:
   Elastic(const Positions& X, const Faces& faces, const std::string& bending_model)
@@ -141,8 +141,8 @@ class Elastic {
     elastic::prepare(model_, slots_);
   }
 
-  /// Make the faces woven, or isotropic again where `axes` is empty. To be called before
-  /// set_parameters(), which takes the warp's stiffnesses.
+  /// Make the faces woven, or isotropic again if `axes` is empty. Call this before set_parameters(),
+  /// which sets the stiffnesses of the warp.
   ///
   /// @param axes     [2 F] unit vectors of the warp in the rest frames
   /// @param woven    [4 F] k_f, k_s, D_f and D_t, one after the other
@@ -175,7 +175,8 @@ class Elastic {
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 
-  /// Stretch and its damping alone by the kernels of a level: change of the energy, gradient and Hessian's blocks.
+  /// Stretch and its damping by the kernels of a level: change of the energy, gradient and blocks of the
+  /// Hessian.
   nb::tuple stretch(const std::string& level,
                     const Positions& x0,
                     const Positions& x1,
@@ -205,7 +206,7 @@ class Elastic {
     return nb::make_tuple(change, rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
-  /// The same of bending that is not flat; the Hessian's blocks without their multiples of the identity.
+  /// Same for bending that is not flat; the Hessian's blocks exclude their multiples of the identity.
   nb::tuple bending(const std::string& level,
                     const Positions& x0,
                     const Positions& x1,
@@ -237,7 +238,7 @@ class Elastic {
     return owned(pairs.data(), {pairs.size() / 2, 2});
   }
 
-  /// The Hessian at x with stresses extrapolated on the straight way from x0.
+  /// The Hessian at x with stresses extrapolated along the straight motion from x0.
   Array extrapolated_hessian(const Positions& x0, const Positions& x, bool positive) const {
     const Curvature curvature = positive ? Curvature::kPositive : Curvature::kExact;
     const std::vector<double> from = positions("x0", x0);
@@ -250,7 +251,7 @@ class Elastic {
     return dense(blocks.data());
   }
 
-  /// Every slot of the base pattern in its own place.
+  /// Identity map of the slots of the base pattern.
   std::vector<Index> own_places() const {
     std::vector<Index> place(pattern_.block_count());
     std::iota(place.begin(), place.end(), 0);
@@ -297,8 +298,8 @@ class Elastic {
     return result;
   }
 
-  /// L of the constant form with springs to targets, a product with it, what it costs to go from u by s, and
-  /// the cotangents of  z . L u.
+  /// L of the constant form with springs to targets, a product with it, the energy change from u by s,
+  /// and the cotangents of  z . L u.
   nb::dict constant_form(const Indices& vertex,
                          const Values& stiffness,
                          const Positions& u,
@@ -430,7 +431,7 @@ auto copied(const Given& values) {
   return std::vector(values.data(), values.data() + values.size());
 }
 
-/// Springs and their targets, which a test varies by making others.
+/// Springs and their targets; a test creates one for each set of inputs.
 class Springs {
  public:
   Springs(const Indices& start,

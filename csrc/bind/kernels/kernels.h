@@ -13,23 +13,23 @@ namespace diffcloth::bind {
 
 namespace nb = nanobind;
 
-/// Which surfaces of a test's mesh touch; there are as many as its vertices and flags name.
+/// Pairs of surfaces of a test's mesh that may touch; their number follows from the vertices and flags.
 contact::SurfacePairs touching_surfaces(const std::vector<Index>& vertex_surface,
                                         Index cloth_count,
                                         bool self_contact,
                                         const std::vector<bool>& body_dynamic,
                                         const std::vector<std::array<Index, 2>>& ignored_pairs);
 
-/// The level of that name, among those that this machine has.
+/// Level with this name, among the supported levels of this machine.
 linalg::KernelLevel level_named(const std::string& name);
 
 /// Drag of faces, for tests against its formula and differences.
 void air_kernels(nb::module_& m);
 
-/// What bodies are made of, for tests against independent references.
+/// Functions of bodies, for tests against independent references.
 void body_kernels(nb::module_& m);
 
-/// Threads, for tests of what happens when they fail or are interrupted.
+/// Threads, for tests of failures and interrupts.
 void common_kernels(nb::module_& m);
 
 /// Contact kernels one by one, for tests against independent references.
@@ -38,7 +38,7 @@ void contact_kernels(nb::module_& m);
 /// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
 void contact_potentials(nb::module_& m);
 
-/// Derivatives of contacts along several directions, for tests of their bits.
+/// Derivatives of contacts along several directions, for tests of bitwise equality.
 void direction_kernels(nb::module_& m);
 
 /// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.

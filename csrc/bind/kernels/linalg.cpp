@@ -174,7 +174,7 @@ class Factor {
 
  private:
   static linalg::BlockMatrix matrix(const Analysis& analysis, const Blocks& blocks) {
-    static const std::vector<char> none;  // only couplings beyond the pattern ask for it
+    static const std::vector<char> none;  // read only for couplings beyond the pattern
     linalg::BlockMatrix result(
         std::make_shared<const linalg::MergedPattern>(linalg::merge(analysis.pattern, {})), none);
     std::copy_n(blocks.data(), 9 * blocks.shape(0), result.blocks());

@@ -1,6 +1,6 @@
 #include "bind/kernels/kernels.h"
 
-// A module of its own, so that what is shipped holds nothing that only tests call.
+// A separate module, so that the shipped one contains no code for tests.
 NB_MODULE(_kernels, m) {
   diffcloth::bind::nb::set_leak_warnings(false);  // see bind/module.cpp
   m.doc() = "Single kernels of the C++ core, exposed for tests and benchmarks.";

@@ -27,7 +27,7 @@ inline void check_point_count(const char* name, const PointRows& x, Index expect
                               std::to_string(expected) + " rows, got " + std::to_string(x.rows()));
 }
 
-/// The Hessian where a potential stands, [3 n, 3 n], assembled as a step does it.
+/// Hessian of a potential at its current point, [3 n, 3 n], assembled as in a step.
 inline Eigen::MatrixXd dense_hessian(const Potential& potential,
                                      const linalg::BlockPattern& base,
                                      const double* x,
@@ -51,11 +51,11 @@ inline Eigen::MatrixXd dense_hessian(const Potential& potential,
   return dense;
 }
 
-/// Bind what every potential has: energy, energy_change, gradient, hessian and hessian_product. Its inputs
-/// and their cotangents are its own.
+/// Bind the functions common to all potentials: energy, energy_change, gradient, hessian and
+/// hessian_product. Inputs and their cotangents are specific to a potential.
 ///
-/// @tparam Kernel  has pattern(), the base pattern over all points; and between(x, to), a potential that
-///                 stands at x and knows the way to `to`, until the next call
+/// @tparam Kernel  has pattern(), the base pattern over all points; and between(x, to), a potential
+/// whose current point is x and whose motion is x -> `to`, until the next call
 template <class Kernel>
 void bind_potential(nb::class_<Kernel>& kernel) {
   using namespace nb::literals;

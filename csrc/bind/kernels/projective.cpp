@@ -34,7 +34,7 @@ linalg::BlockPattern pattern_of(const Pairs& pairs, std::size_t vertices) {
   return linalg::BlockPattern::from_pairs(static_cast<Index>(vertices), std::move(list));
 }
 
-/// A cache of constant matrices on one pattern, and what it holds.
+/// A cache of constant matrices on one pattern, with its contents.
 class ConstantMatrices {
  public:
   ConstantMatrices(const Pairs& pairs, const Flags& fixed)

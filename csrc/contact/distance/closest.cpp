@@ -9,13 +9,13 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Relative |u x v|^2 below which directions count as parallel: the square of 1.6e-8, where the
-/// cross product of double coordinates still has half of its digits.
+/// Relative |u x v|^2 below which directions count as parallel: the square of 1.6e-8, at which the cross
+/// product of double coordinates still has half of its digits.
 constexpr double kParallel = 2.5e-16;
 
 /// Distance from a vertex to an edge, as found while classifying.
 struct Nearest {
-  int vertex;  ///< corner of the point (its sign is that of the primitive it belongs to)
+  int vertex;  ///< corner index of the point; its sign depends on the primitive it belongs to
   int e0, e1;  ///< corners of the edge
   double a;    ///< parameter on the edge, clamped to [0, 1]
   double d_sq = std::numeric_limits<double>::infinity();
@@ -74,8 +74,8 @@ Mat2 inverse_metric(const Vec3& s0, const Vec3& s1, double determinant) {
   return M_inv / determinant;
 }
 
-/// How far outside a triangle a point counts as above it, in parameters: by the rounding of those. The
-/// distance does not notice.
+/// Tolerance outside a triangle, in barycentric parameters, within which a point still projects onto it:
+/// the rounding error of the parameters. The distance is not affected.
 double border(const Vec3& e0, const Vec3& e1, const Vec3& w, double n_sq) {
   constexpr double kBorder = 2e-12;
   const double longest_sq = std::max(e0.squaredNorm(), e1.squaredNorm());
@@ -138,7 +138,7 @@ Nearest nearest_end(const Corners& x) {
   return nearer(nearer(a0, a1), nearer(b0, b1));
 }
 
-/// Whether the vertex belongs to the first primitive: +1, or -1.
+/// +1 if the vertex belongs to the first primitive, else -1.
 double sign_of(PairKind kind, const Nearest& nearest) {
   return kind == PairKind::kPointTriangle || nearest.vertex < 2 ? 1.0 : -1.0;
 }

@@ -35,12 +35,12 @@ struct Closest {
 
 /// Classify a pair by the region that its closest points lie in, and describe its closest vector.
 ///
-/// Degenerate triangles take the nearest of their edges. Edges with |u x v|^2 below 2.5e-16
+/// A degenerate triangle is replaced by the nearest of its edges. Edges with |u x v|^2 below 2.5e-16
 /// |u|^2 |v|^2 are parallel and never of type line-line.
 Closest closest(PairKind kind, const Corners& x);
 
-/// What closest() finds of where the closest points lie, with its bits, and not how they move: that costs as much
-/// again.
+/// Location of the closest points, with the same bits as by closest(), but without derivatives, which
+/// double the cost.
 struct ClosestPoints {
   Vec4 c;
   int parameter_count;
@@ -54,8 +54,8 @@ Vec12 distance_sq_gradient(const Closest& pair);
 /// Hessian of the squared distance [-]; exact, hence indefinite.
 Mat12 distance_sq_hessian(const Closest& pair);
 
-/// The part of it that comes from how the nearest points slide, left right^T = -2 G M^-1 G^T; the other one
-/// is 2 c c^T (x) I. Columns beyond parameter_count are zero.
+/// Part of the Hessian due to sliding of the closest points, left right^T = -2 G M^-1 G^T; the other
+/// part is 2 c c^T (x) I. Columns beyond parameter_count are zero.
 struct Sliding {
   Eigen::Matrix<double, 12, 2> left;
   Eigen::Matrix<double, 12, 2> right;

@@ -5,10 +5,10 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Edges that count as parallel at rest and now are this share of |U|^2 |V|^2 apart, squared: an
-/// angle of 1.8 degrees at rest length.
+/// Edges count as parallel if |u x v|^2 is below this fraction of |U|^2 |V|^2: an angle of 1.8 degrees
+/// at rest length.
 constexpr double kThreshold = 1e-3;
-/// Likewise against the segment of a round body: 18 degrees.
+/// Same for the segment of a round body: 18 degrees.
 constexpr double kRoundThreshold = 0.1;
 
 double cross_sq(const Corners& x) { return Vec3(x[1] - x[0]).cross(x[3] - x[2]).squaredNorm(); }

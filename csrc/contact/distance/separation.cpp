@@ -7,8 +7,8 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Squared sine of an angle below which a triangle is a sliver: its interior is only one candidate
-/// of several there, because it is uncertain which region the closest point lies in.
+/// Squared sine of an angle below which a triangle is a sliver: its interior then is only one of several
+/// candidates, because the region of the closest point is uncertain.
 constexpr double kSliver = 1e-6;
 
 double clamp01(double a) { return std::min(std::max(a, 0.0), 1.0); }
@@ -18,7 +18,7 @@ double clamped_ratio(double numerator, double denominator) {
   return denominator > 0 ? clamp01(numerator / denominator) : 0.0;
 }
 
-/// The shortest vector seen so far.
+/// Shortest of the vectors offered.
 struct Shortest {
   Vec3 t;
   double d_sq;
@@ -50,7 +50,8 @@ Vec3 point_triangle(const Vec3& p, const Vec3& t0, const Vec3& t1, const Vec3& t
     double b1 = e0.cross(w).dot(n) / n_sq;
     const bool sliver = n_sq < kSliver * e0.squaredNorm() * e1.squaredNorm();
     if (sliver) {
-      // b0 and b1 carry an error of rounding / sin(angle): improve them with what is left of w.
+      // b0 and b1 have an error of rounding / sin(angle): correct them by one step of iterative
+      // refinement.
       const Vec3 rest = w - b0 * e0 - b1 * e1;
       b0 += rest.cross(e1).dot(n) / n_sq;
       b1 += e0.cross(rest).dot(n) / n_sq;
@@ -79,8 +80,9 @@ Vec3 edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1) {
   const double vw = v.dot(w);
   const auto at = [&](double s, double t) -> Vec3 { return w + s * u - t * v; };
 
-  // Between the lines. An error of s, rounding / sin(angle), moves the point of a along u; with t
-  // projected anew it changes the distance only by that times sin(angle), however parallel u and v.
+  // Between the lines. An error of s, rounding / sin(angle), moves the point of a along u. With t
+  // projected again, the distance changes only by that error times sin(angle), however parallel u and v
+  // are.
   if (n_sq > 0) {
     const double s = v.cross(w).dot(n) / n_sq;
     const double t = (vw + s * uv) / vv;
