@@ -201,7 +201,7 @@ bool Directions::descend(const linalg::BlockMatrix& A, bool doubts) {
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
                                                       const linalg::BlockMatrix& P) {
   make_room();
-  double curvature = 0.0;  // of the exact quadratic model along p
+  double curvature = 0.0;  // curvature of the exact quadratic model along p
   for (;;) {
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;

@@ -83,7 +83,7 @@ class Descent {
     double balance = 0.0;  ///< change so far [J]
     int steps = 0;
   };
-  bool away_ = false;  ///< on an excursion
+  bool away_ = false;  ///< true on an excursion
   Excursion excursion_;
   int wait_ = kExcursions.patience;  ///< ordinary steps before the next excursion
   int next_wait_ = 1;                ///< ordinary steps after the next failed excursion

@@ -10,10 +10,10 @@ namespace diffcloth::solver {
 
 struct Outcome {
   Criterion criterion = Criterion::kIterationLimit;
-  double residual = 0.0;         ///< |p|_inf / h of the last Newton step [m/s]
+  double residual = 0.0;         ///< displacement rate |p|_inf / h of the last Newton step [m/s]
   double motion_fraction = 1.0;  ///< fraction of the prescribed motion that was reached
   bool certified = false;        ///< converged, at a positive definite Hessian
-  Certificate certificate;       ///< at the solution, if certified
+  Certificate certificate;       ///< certificate of the solution, if certified
   Factor nearby;                 ///< last exact Hessian, for the next solve; may be null
 };
 

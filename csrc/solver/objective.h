@@ -27,7 +27,7 @@ struct Objective {
   std::vector<Potential*> others;                ///< all but inertia, friction and contact
   Potential* friction = nullptr;                 ///< null if nothing touched
   contact::ContactPotential* contact = nullptr;  ///< null if nothing can touch
-  bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null if there are none
+  bodies::CoordinatePotential* chart = nullptr;  ///< potential of free coordinates; null if there are none
   /// Bodies on which only contact and `chart`, a quadratic form for them, depend.
   std::span<const bodies::Mechanisms::FreeBody> free_bodies;
   PatternCache* patterns;

@@ -17,7 +17,7 @@ namespace diffcloth::solver {
 using linalg::dot;
 
 struct Options {
-  double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
+  double tolerance;    ///< bound on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< limit for a step, over all its solves
   double max_seconds = std::numeric_limits<double>::infinity();  ///< limit for a step [s]
   /// If true, every solve ends with a factor of the Hessian at its end. Otherwise a Newton or chord step

@@ -25,18 +25,18 @@ class Cotangents {
   /// Write all cotangents into the gradients of the inputs.
   void write(Problem& problem, const Gradients& gradients);
 
-  std::vector<double> rows;         ///< of the outputs x_{n+1}, q_{n+1} and, divided by h, v_{n+1}
+  std::vector<double> rows;         ///< bars of x_{n+1}, q_{n+1} and, divided by h, v_{n+1}
   std::vector<double> start;        ///< x_n and o_n: all points
   std::vector<double> origins;      ///< origins of friction's displacements, if not the start
   std::vector<double> ends;         ///< prescribed points at their ends: all points
   std::vector<double> velocities;   ///< v_n
   std::vector<double> masses;       ///< [N]
-  std::vector<double> body_forces;  ///< of the output [3 V]
+  std::vector<double> body_forces;  ///< bar of the output [3 V]
   std::vector<double> contact_forces;  ///< likewise [3 N]
   std::vector<double> pin_forces;      ///< likewise [3 P]
   contact::ContactModel::Bar contact;
 
-  mesh::RestShapeBar rest;  ///< of the cloths' rest shape; empty if not requested
+  mesh::RestShapeBar rest;  ///< bar of the cloths' rest shape; empty if not requested
 
   /// Adds the cotangents that a stage keeps to the gradients of the inputs; called by write().
   using PullBack = std::function<void(const Gradients& gradients)>;

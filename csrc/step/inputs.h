@@ -18,7 +18,7 @@ enum class Input : std::uint8_t {
   kPositions,          ///< x_n [m]
   kVelocities,         ///< v_n [m/s]
   kBodyPoses,          ///< frames of the roots of all trees at the start of the step
-  kBodyTargets,        ///< at its end
+  kBodyTargets,        ///< these frames at the end of the step
   kPinTargets,         ///< [m]
   kSoftPinTargets,     ///< [m]
   kForces,             ///< [N]
@@ -46,8 +46,8 @@ enum class Input : std::uint8_t {
   kTangentialDrag,     ///< C_t [-]
   kAirDensity,         ///< rho [kg/m^3]
   kWind,               ///< w [m/s]
-  kCoordinates,        ///< of mechanisms, at the start of the step
-  kCoordinateEnds,     ///< at its end, where prescribed
+  kCoordinates,        ///< coordinates of mechanisms at the start of the step
+  kCoordinateEnds,     ///< coordinates at the end of the step, where prescribed
   kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
   kCoordinateMetric,   ///< A
   kJointTerms,         ///< rows of bodies::JointTerm; absent: no coordinate has one

@@ -37,7 +37,7 @@ class Problem {
   mesh::RestShape own_rest_;
 
  public:
-  const mesh::RestShape* rest;  ///< of the scene, or of the rest_positions input
+  const mesh::RestShape* rest;  ///< rest shape of the scene, or of the rest_positions input
   contact::RestMeasures measures;
   std::vector<double> density;  ///< [F]
   std::vector<double> masses;   ///< [N] lumped [kg]

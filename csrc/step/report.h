@@ -26,7 +26,7 @@ struct PairContacts {
   Index first = 0;
   Index second = 0;
   Index count = 0;
-  Vec3 force = Vec3::Zero();  ///< of the first on the second, barrier and friction [N]
+  Vec3 force = Vec3::Zero();  ///< force of the first on the second, barrier and friction [N]
 };
 
 /// A contact between two surfaces; the first has the smaller index.
@@ -34,10 +34,10 @@ struct ContactPoint {
   Index first = 0;
   Index second = 0;
   std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest points, one on each surface [m]
-  Vec3 normal = Vec3::Zero();                              ///< from the first to the second
-  double gap = 0.0;                      ///< between the surfaces, without their thickness [m]
-  double normal_force = 0.0;             ///< of the first on the second, along the normal [N]
-  Vec3 tangential_force = Vec3::Zero();  ///< likewise, of friction [N]
+  Vec3 normal = Vec3::Zero();                              ///< direction from the first to the second
+  double gap = 0.0;                      ///< distance of the surfaces, without their thickness [m]
+  double normal_force = 0.0;             ///< force of the first on the second along the normal [N]
+  Vec3 tangential_force = Vec3::Zero();  ///< friction of the first on the second [N]
 };
 
 struct Report {
@@ -46,7 +46,7 @@ struct Report {
   bool certified = true;  ///< every solve ended with a factor of its Hessian
   Index iterations = 0;
   double residual = 0.0;          ///< |p|_inf / h [m/s]
-  double minimum_distance = 0.0;  ///< over the pairs in contact; infinite without contact [m]
+  double minimum_distance = 0.0;  ///< minimum over the pairs in contact; infinite without contact [m]
   Index contact_count = 0;
   double motion_fraction = 1.0;
   std::vector<double> root_poses;  ///< poses at the end of an incomplete motion [T, 7]; else empty
@@ -57,7 +57,7 @@ struct Report {
   Seconds seconds{};
   double cpu_seconds = 0.0;  ///< processor time of the threads of the environment [s]
   std::string message;
-  std::vector<PairContacts> pairs;   ///< in ascending order
+  std::vector<PairContacts> pairs;   ///< pairs in ascending order
   std::vector<ContactPoint> points;  ///< contacts with barrier and friction, not nodes
 
   /// Call visit(name, value) for every number except times.

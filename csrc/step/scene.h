@@ -86,8 +86,8 @@ inline constexpr std::array kElasticSolvers{
 /// Springs between points of cloths and bodies, or to targets: see elastic/springs.h.
 struct AttachmentDescription {
   std::vector<Index> start{0};      ///< [A + 1] first point of each
-  std::vector<Index> point;         ///< of cloths, then of bodies
-  std::vector<double> coefficient;  ///< of the points
+  std::vector<Index> point;         ///< points of cloths, then of bodies
+  std::vector<double> coefficient;  ///< coefficients of the points
   std::vector<double> rest_length;  ///< [A] [m]
   std::vector<Index> target_row;    ///< [A] row among the targets, -1: none
   Index target_count = 0;
@@ -114,7 +114,7 @@ struct Description {
   /// [surfaces of bodies] shapes of surfaces that cloths touch at their nodes, instead of by the
   /// barrier; empty: none
   std::vector<projective::Primitive> primitives;
-  std::vector<std::string> surface_names;  ///< in messages; empty: surfaces have numbers
+  std::vector<std::string> surface_names;  ///< names in messages; empty: surfaces have numbers
   std::vector<std::string> pin_names;      ///< [P] group of each pin; empty: none
   bool self_contact = true;
   double dt = 0.01;
@@ -148,14 +148,14 @@ struct Scene {
   std::vector<Vec2> material_axes;  ///< [F] the warp in the rest frames; empty: no weft
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
-  mesh::RestShape rest;  ///< of given.rest_positions
+  mesh::RestShape rest;  ///< rest shape of given.rest_positions
   bodies::Mechanisms mechanisms;
   contact::CollisionMesh collision_mesh;
   std::vector<bodies::Mechanisms::FreeBody>
       free_bodies;                          ///< bodies without springs; surfaces of the scene
-  double mean_edge;                         ///< of the cloths at rest, else of the bodies [m]
+  double mean_edge;                         ///< mean edge of the cloths at rest, else of the bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
-  contact::RestMeasures measures;           ///< of given.rest_positions and the bodies
+  contact::RestMeasures measures;           ///< measures of given.rest_positions and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] of surfaces that nodes touch
@@ -164,9 +164,9 @@ struct Scene {
   elastic::Elements held_elements;  ///< elements with a pinned corner
 
   mutable elastic::PreparedCache prepared;                    ///< models of `rest`
-  mutable solver::PatternCache elastic_patterns;              ///< over the elastic pattern
-  mutable solver::PatternCache diagonal_patterns;             ///< over isolated vertices
-  mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern
+  mutable solver::PatternCache elastic_patterns;              ///< patterns over the elastic pattern
+  mutable solver::PatternCache diagonal_patterns;             ///< patterns over isolated vertices
+  mutable projective::ConstantMatrixCache constant_matrices;  ///< matrices over the elastic pattern
 };
 
 /// Rest quantities that weight contacts, for a rest shape of the cloths.

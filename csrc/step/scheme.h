@@ -14,9 +14,9 @@ namespace diffcloth::step {
 
 /// Arrays to which the stages of a step add the forces at its end [N].
 struct Forces {
-  double* bodies;   ///< of contact, on the bodies' vertices [V, 3]
-  double* contact;  ///< of contact, on the cloths' vertices [N, 3]
-  double* pins;     ///< holding the pinned vertices in place [P, 3]
+  double* bodies;   ///< contact forces on the bodies' vertices [V, 3]
+  double* contact;  ///< contact forces on the cloths' vertices [N, 3]
+  double* pins;     ///< forces that hold the pinned vertices [P, 3]
 };
 
 /// Add the forces that hold pins: the gradient of the objective at them.
@@ -31,7 +31,7 @@ struct Forward {
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<double>& tape;  ///< empty: no tape
-  solver::KeptSolves& kept;    ///< for backward
+  solver::KeptSolves& kept;    ///< solves kept for backward
   Report& report;
 };
 
@@ -54,7 +54,7 @@ struct Backward : Taken {
 /// A forward pass of tangents along several directions of the inputs side by side.
 struct Pushforward : Taken {
   std::span<const Tangents> directions;
-  std::span<const Forces> forces;  ///< for each direction: receives the changes of the forces
+  std::span<const Forces> forces;  ///< changes of the forces for each direction are added here
 };
 
 /// A scheme for a step: its minimizations, their order, and their derivatives.

@@ -41,7 +41,7 @@ Report forward(const Scene& scene,
 
 /// Output cotangents and input gradients of one loss.
 struct Loss {
-  Arrays<const double> cotangents;  ///< of the outputs, by their names
+  Arrays<const double> cotangents;  ///< cotangents of the outputs, by their names
   Gradients gradients;              ///< the same inputs for all losses
 };
 
@@ -64,7 +64,7 @@ void backward(const Scene& scene,
 
 /// Tangents of the inputs, and arrays for the tangents of the outputs.
 struct Direction {
-  Inputs tangents;         ///< with the counts of the inputs; zero where null
+  Inputs tangents;         ///< tangents with the counts of the inputs; zero where null
   Arrays<double> outputs;  ///< named like output_fields(), zeroed
 };
 
@@ -88,7 +88,7 @@ std::string find_overlap(const Scene& scene, const Inputs& inputs);
 /// Two surfaces that the barrier throws apart from the start of a step.
 struct Throw {
   std::string elements;     ///< nearest elements of both
-  double gap;               ///< between these elements [m]
+  double gap;               ///< distance of these elements [m]
   double barrier_distance;  ///< d_hat [m]
   double speed;             ///< largest speed of a point that the barrier moves [m/s]
 };

@@ -33,7 +33,7 @@ namespace {
 using contact::Contact;
 using Array = std::vector<double>;
 
-constexpr int kHalvings = 50;  // of an interval, to the resolution of float64
+constexpr int kHalvings = 50;  // halvings of an interval, to the resolution of float64
 
 /// Smallest argument at which a monotone condition holds.
 template <class Condition>

@@ -32,8 +32,8 @@ namespace {
 /// Cotangents that the forces pull back: E^T E g at nodes; minus E g at bodies, shared by the corners of
 /// the nearest faces; g at pins.
 struct ForcesBar {
-  Array eta;                            ///< of the rows
-  std::vector<Vec3> surface_point_bar;  ///< of each contact
+  Array eta;                            ///< cotangents at the rows
+  std::vector<Vec3> surface_point_bar;  ///< cotangent of each contact
   bool any;                             ///< true if any of these is not zero
 };
 

@@ -18,7 +18,7 @@ struct NodalContacts {
   std::vector<projective::NodalContact> list;
   std::vector<Index> partner;            ///< [N] vertex in contact with each, or -1
   std::vector<double> inertia;           ///< [N] rho, see nodal/system.cpp [kg]
-  std::unique_ptr<Potential> couplings;  ///< of pairs, without energy; null without pairs
+  std::unique_ptr<Potential> couplings;  ///< couplings of pairs, without energy; null without pairs
 };
 
 /// The cloths on that path.

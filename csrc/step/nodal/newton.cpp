@@ -282,11 +282,11 @@ class NodalSolve {
   NodalSystem::Point there_;
   std::unique_ptr<const linalg::BlockMatrix> H_;  // exact, at `here`
   std::unique_ptr<const linalg::BlockMatrix> S_;  // see nodal/system.cpp
-  solver::Factor factor_;                         // of S; null if indefinite
+  solver::Factor factor_;                         // factor of S; null if indefinite
   Array constraint_step_;
 
   double blend_ = 0.0;
-  int descents_ = 0;          // by cases, since the last successful Newton step
+  int descents_ = 0;          // descents by cases since the last successful Newton step
   double least_ = kInfinity;  // smallest residual with a definite S
   double last_ = kInfinity;   // length of the last step [m]
   double longest_ = 0.0;      // longest step so far [m]

@@ -42,7 +42,7 @@ class NodalSystem {
   /// The equations at a point.
   struct Point {
     std::vector<double> x;
-    std::vector<double> g;  ///< of all points
+    std::vector<double> g;  ///< gradient at all points
     std::vector<projective::Coulomb> laws;
     std::vector<Vec3> u;  ///< relative velocities [m/s]
     double merit = 0.0;   ///< sum of |residual|^2 / rho [J]

@@ -22,7 +22,7 @@ struct ContactStage {
   std::vector<Potential*> others;
   solver::PatternCache& patterns;
   std::size_t first_factor;      ///< index of its first factor among the scheme's
-  const Potential* attachments;  ///< of cloths to bodies, as weighted in this stage
+  const Potential* attachments;  ///< springs between cloths and bodies, as weighted in this stage
   Turn::Exchange exchange;       ///< cotangents of the stage's potentials; for backward only
   SetTangents set_tangents;      ///< tangents of the stage's potentials; for tangent only
 

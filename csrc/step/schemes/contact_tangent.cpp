@@ -30,8 +30,8 @@ using Array = std::vector<double>;
 
 /// Changes of grad E at all points along a direction of the potentials' inputs, at fixed points.
 struct GradientTangent {
-  Array touching;  ///< of barrier and friction
-  Array others;    ///< of the others
+  Array touching;  ///< change due to barrier and friction
+  Array others;    ///< change due to the other potentials
 };
 
 std::vector<GradientTangent> gradient_tangents(

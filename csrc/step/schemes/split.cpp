@@ -164,7 +164,7 @@ class Nearness {
   Problem& problem_;
   Array x_d_;
   // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
-  std::optional<Proximity> inertial_;  ///< in G less h^2 L, which is diagonal [kg]
+  std::optional<Proximity> inertial_;  ///< nearness in the diagonal matrix G - h^2 L [kg]
   std::optional<elastic::ElasticNearness> elastic_;
   std::optional<Tilt> tilt_;
 };
