@@ -16,10 +16,9 @@ inline constexpr int kBendingLanes = 8;
 /// The i-th vertices of eight elements.
 struct BendingPoint {
   std::int32_t vertex[kBendingLanes];
-  std::int32_t slot[3][kBendingLanes];  ///< slots of its blocks with base corners up to itself
-  std::int64_t
-      above[3][kBendingLanes];  ///< -1 if these lie transposed in the lower triangle, else 0
-  double c[3][kBendingLanes];   ///< c_uu, c_uv, c_vv [1/m^2]
+  std::int32_t slot[3][kBendingLanes];   ///< slots of its blocks with base corners up to itself
+  std::int64_t above[3][kBendingLanes];  ///< -1 if transposed, else 0
+  double c[3][kBendingLanes];            ///< c_uu, c_uv, c_vv [1/m^2]
 };
 
 /// Up to eight elements with equal numbers of vertices: unused lanes repeat the last element with weight

@@ -55,7 +55,7 @@ struct Prepared {
   std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
   std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, zero if not damped
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
-  std::vector<double> identity;       ///< [slots] sum of the multiples of I in all elements' Hessians
+  std::vector<double> identity;       ///< [slots] sum of all elements' multiples of I
   std::vector<StretchBatch> stretch;  ///< batches of isotropic faces
   std::vector<WovenBatch> woven;      ///< batches of all other faces
   std::vector<DampingBatch> damping_of_stretch;  ///< batches of damped faces

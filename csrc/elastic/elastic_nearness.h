@@ -31,7 +31,7 @@ class ElasticNearness final : public Potential {
   void swap_cotangents(CotangentStore& store) override { store.exchange(target_bar); }
 
   std::vector<double> target_bar;  ///< [3 N], zero until accumulate()
-  std::vector<double> target_dot;  ///< [3 N] tangent, for add_tangent(); the potentials hold all others
+  std::vector<double> target_dot;  ///< [3 N] tangent, for add_tangent(); others: the potentials
 
  private:
   /// u = x - y [3 N].

@@ -18,7 +18,7 @@ inline constexpr int kStretchLanes = 8;
 struct FaceBatch {
   std::int32_t size;                      ///< number of used lanes
   std::int32_t vertex[3][kStretchLanes];  ///< ascending
-  std::int32_t slot[6][kStretchLanes];    ///< slots of the pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
+  std::int32_t slot[6][kStretchLanes];    ///< pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
   double g[4][kStretchLanes];             ///< shape gradients of corners 1 and 2 [1/m]
 };
 

@@ -43,7 +43,7 @@ struct BendingStencils {
   std::vector<BendingModel> model;          ///< [B]
   std::vector<FittedSide> sides;            ///< [S]
   std::vector<Index> chart_start{0};        ///< [B + S + 1] into `chart_points`
-  std::vector<Index> chart_points;          ///< points of each element's quadratic, then of each side
+  std::vector<Index> chart_points;          ///< points of each element, then of each side
   /// [chart_start.back()] Local edge a -> b about which an extra point is unfolded, to the right of the
   /// edge. Corners of the base face have {-1, -1}.
   std::vector<std::array<Index, 2>> unfold_edge;
@@ -88,7 +88,7 @@ struct RestShape {
   std::vector<double> vertex_area;     ///< [N] a third of the adjacent faces [m^2]
   std::vector<double> edge_area;       ///< [E] a third of the adjacent faces [m^2]
   std::vector<double> edge_length_sq;  ///< [E] [m^2]
-  bool curved = false;                 ///< some curvature is above rounding; all others are exactly 0
+  bool curved = false;                 ///< some curvature exceeds rounding; others are exactly 0
 };
 
 RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, const double* X);

@@ -173,7 +173,7 @@ LeastHessian least_hessian(const Mat3& G, const Mat3& D, const Vec3& c2) {
 ///   (P Q P + kRidge^2) v = P (K^T t - Q z),   Q = K^T K + kRidge^2.
 struct SideFit {
   int count, a, b;
-  SidePoints x, x_mean_free;  ///< positions relative to the middle of the side; relative to the mean
+  SidePoints x, x_mean_free;  ///< relative to the middle of the side; to the mean
   Vec2 half;
   Metric<double> scales;
   SideTarget<double> target;

@@ -14,8 +14,8 @@ namespace diffcloth::solver {
 
 /// The matrix from which a direction was computed.
 enum class Kind : std::uint8_t {
-  kFactored,  ///< the exact Hessian, factored here; its factor certifies a minimum
-  kIterated,  ///< the exact Hessian, solved by conjugate gradients
+  kFactored,      ///< the exact Hessian, factored here; its factor certifies a minimum
+  kIterated,      ///< the exact Hessian, solved by conjugate gradients
   kPrimalDual,    ///< the exact Hessian with duals of friction, factored here
   kChord,         ///< a factor of one of these at an earlier point
   kDamped,        ///< the exact Hessian blended with its projection

@@ -27,11 +27,11 @@ struct Objective {
   std::vector<Potential*> others;                ///< all but inertia, friction and contact
   Potential* friction = nullptr;                 ///< null if nothing touched
   contact::ContactPotential* contact = nullptr;  ///< null if nothing can touch
-  bodies::CoordinatePotential* chart = nullptr;  ///< potential of free coordinates; null if there are none
+  bodies::CoordinatePotential* chart = nullptr;  ///< potential of free coordinates; may be null
   /// Bodies on which only contact and `chart`, a quadratic form for them, depend.
   std::span<const bodies::Mechanisms::FreeBody> free_bodies;
   PatternCache* patterns;
-  linalg::Couplings expected;  ///< couplings of rows beyond the base pattern, sorted: always in pattern()
+  linalg::Couplings expected;  ///< couplings beyond the base pattern, sorted: always in pattern()
 
   /// Couplings of friction alone, valid as long as `friction`; empty until first used.
   mutable std::optional<linalg::Couplings> of_friction;

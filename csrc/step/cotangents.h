@@ -25,13 +25,13 @@ class Cotangents {
   /// Write all cotangents into the gradients of the inputs.
   void write(Problem& problem, const Gradients& gradients);
 
-  std::vector<double> rows;         ///< bars of x_{n+1}, q_{n+1} and, divided by h, v_{n+1}
-  std::vector<double> start;        ///< x_n and o_n: all points
-  std::vector<double> origins;      ///< origins of friction's displacements, if not the start
-  std::vector<double> ends;         ///< prescribed points at their ends: all points
-  std::vector<double> velocities;   ///< v_n
-  std::vector<double> masses;       ///< [N]
-  std::vector<double> body_forces;  ///< bar of the output [3 V]
+  std::vector<double> rows;            ///< bars of x_{n+1}, q_{n+1} and, divided by h, v_{n+1}
+  std::vector<double> start;           ///< x_n and o_n: all points
+  std::vector<double> origins;         ///< origins of friction's displacements, if not the start
+  std::vector<double> ends;            ///< prescribed points at their ends: all points
+  std::vector<double> velocities;      ///< v_n
+  std::vector<double> masses;          ///< [N]
+  std::vector<double> body_forces;     ///< bar of the output [3 V]
   std::vector<double> contact_forces;  ///< likewise [3 N]
   std::vector<double> pin_forces;      ///< likewise [3 P]
   contact::ContactModel::Bar contact;

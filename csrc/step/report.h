@@ -33,8 +33,8 @@ struct PairContacts {
 struct ContactPoint {
   Index first = 0;
   Index second = 0;
-  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest points, one on each surface [m]
-  Vec3 normal = Vec3::Zero();                              ///< direction from the first to the second
+  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest point on each surface [m]
+  Vec3 normal = Vec3::Zero();            ///< direction from the first to the second
   double gap = 0.0;                      ///< distance of the surfaces, without their thickness [m]
   double normal_force = 0.0;             ///< force of the first on the second along the normal [N]
   Vec3 tangential_force = Vec3::Zero();  ///< friction of the first on the second [N]
@@ -42,11 +42,11 @@ struct ContactPoint {
 
 struct Report {
   Result result = Result::kConverged;
-  solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< criterion that ended the deciding solve
+  solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< end of the deciding solve
   bool certified = true;  ///< every solve ended with a factor of its Hessian
   Index iterations = 0;
   double residual = 0.0;          ///< |p|_inf / h [m/s]
-  double minimum_distance = 0.0;  ///< minimum over the pairs in contact; infinite without contact [m]
+  double minimum_distance = 0.0;  ///< smallest in contact; infinite without contact [m]
   Index contact_count = 0;
   double motion_fraction = 1.0;
   std::vector<double> root_poses;  ///< poses at the end of an incomplete motion [T, 7]; else empty

@@ -50,7 +50,7 @@ struct SchemeRow {
   SchemeKind value;
   bool has_barrier = true;         ///< if false, cloths touch bodies and each other at their nodes
   bool moves_bodies = false;       ///< cloths and dynamic bodies are solved together
-  bool has_elastic_stage = false;  ///< elasticity is solved separately first, by one of kElasticSolvers
+  bool has_elastic_stage = false;  ///< elasticity is first solved alone, by one of kElasticSolvers
   bool has_metrics = false;        ///< nearness may be measured in each of kMetrics
 };
 
@@ -123,7 +123,7 @@ struct Description {
   Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
-  bool begins_at_state = false;  ///< solves begin at the start of the step, not at the inertial guess
+  bool begins_at_state = false;  ///< solves begin at x_n, not at the inertial guess
   solver::Options options{};
 };
 
@@ -153,12 +153,12 @@ struct Scene {
   contact::CollisionMesh collision_mesh;
   std::vector<bodies::Mechanisms::FreeBody>
       free_bodies;                          ///< bodies without springs; surfaces of the scene
-  double mean_edge;                         ///< mean edge of the cloths at rest, else of the bodies [m]
+  double mean_edge;                         ///< mean edge of cloths at rest, else of bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
   contact::RestMeasures measures;           ///< measures of given.rest_positions and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
-  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] of surfaces that nodes touch
+  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] those that nodes touch
   projective::VertexSpheres vertex_spheres;         ///< if the scheme allows vertices to touch
   elastic::Slots slots;
   elastic::Elements held_elements;  ///< elements with a pinned corner
