@@ -51,7 +51,7 @@ enum class Input : std::uint8_t {
   kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
   kCoordinateMetric,   ///< A
   kJointTerms,         ///< rows of bodies::JointTerm; absent: no coordinate has one
-  kFrictionOrigins,    ///< start of friction's displacements [m]; absent: x_n
+  kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
 
 /// Extent of an input: the entities that have one value each. N vertices, F faces and C cloths; T trees

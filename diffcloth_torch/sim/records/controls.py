@@ -53,8 +53,8 @@ class Control:
         attachment_weights: Share of the stiffness with which the springs of attachments pull [-],
             between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and 0
             if a target is not set.
-        wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Acts on faces
-            whose material has drag.
+        wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Faces whose
+            material has drag feel it.
         body_vertices: Positions of the vertices of deforming bodies [m], shape [D, 3], or body ->
             positions [n, 3]; bodies that are not named hold.
     """
