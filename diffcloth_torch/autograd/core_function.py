@@ -41,9 +41,10 @@ def failing_as(operation: str) -> Iterator[None]:
 class CoreFunction(ABC):
     """A function of the core that is evaluated once, by `evaluate`.
 
-    owner: Name of the function in messages.
-    names: Names of its differentiable inputs.
-    tape: Further data for its derivatives, kept by the graph.
+    Attributes:
+        owner: Name of the function in messages.
+        names: Names of its differentiable inputs.
+        tape: Further data for its derivatives, kept by the graph.
     """
 
     owner: str

@@ -105,7 +105,7 @@ def resumed_folder(folder: Path, command: str) -> Iterator[dict[str, Any]]:
 
 
 def _check_places(folder: Path) -> None:
-    """Refuse, before the work, folders at the paths of its results."""
+    """Refuse, before the work, folders at paths of files of results, and vice versa."""
     for name in (*_FILES, *(f"{name}{PART}" for name in _FILES)):
         if (folder / name).is_dir():
             raise InvalidInput(
