@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if find_spec("diffcloth_torch._core") is None:
-    # Python looks into the current folder first: in a clone it finds the sources, and not what
-    # `pip install .` has put elsewhere.
+    # Python searches the current folder first: in a clone it finds the sources, and not the
+    # installed package.
     raise ImportError(
         f"{Path(__file__).parent} holds the sources of diffcloth_torch without a core that was "
         "compiled for this Python: start Python in another folder to import an installed package, "
@@ -115,13 +115,13 @@ __all__ = [
     "where",
 ]
 
-# `import *` reads all of these, and must not fail for want of an extra.
+# `import *` reads all of these names, and must not fail without an extra.
 if find_spec("gymnasium") is None:
     __all__.remove("envs")
     __all__.remove("learn")
 
 
-# Imported on first use: torch takes seconds to import, which `diffcloth --help` need not wait for.
+# Imported on first use: torch takes seconds to import, and `diffcloth --help` should not wait.
 _HOMES = {
     "errors": (
         "AddedMassWarning",
@@ -178,8 +178,8 @@ def load_config(
     >>> states = simulator.rollout(task.initial_state(), controller, steps=task.steps)
 
     Args:
-        path: YAML file; or its content as a dict, where names of files are relative to the
-            current folder.
+        path: YAML file; or its content as a dict, in which file names are relative to the current
+            folder.
         assignments: "key=value" each, as after `--set`.
 
     Returns:
@@ -212,7 +212,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        # Only the package's metadata has it, which is read on first use.
+        # Only the package's metadata has the version, which is read on first use.
         from importlib.metadata import version
 
         return version("diffcloth-torch")

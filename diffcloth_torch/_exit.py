@@ -1,8 +1,8 @@
-"""The end of the interpreter, while daemon threads take steps.
+"""The end of the interpreter, while daemon threads compute steps.
 
-Python then ends a thread as soon as it asks for the GIL, by unwinding its stack, and destructors in
-the C++ of torch and of the core abort the process. Before that the threads that work for us are let
-go on until they are in the core, which keeps them there: see csrc/bind/without_gil.h.
+Python then ends a thread as soon as it requests the GIL, by unwinding its stack, and destructors in
+the C++ of torch and of the core abort the process. Before that, threads of the package may continue
+until they are in the core, which blocks them there: see csrc/bind/without_gil.h.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["note_caller"]
 
 _LONGEST_WAIT = 5.0  # [s]
 _PAUSE = 0.005  # [s]
-_QUIET = 3  # successive looks without a thread at work: one may be between two steps
+_QUIET = 3  # successive polls without a thread at work: one may be between two steps
 _OURS = str(Path(__file__).parent)
 _BACKWARD = (str(Path(torch.autograd.__file__).parent), torch.Tensor.backward.__code__.co_filename)
 
@@ -30,12 +30,12 @@ _callers: set[int] = set()
 
 
 def note_caller() -> None:
-    """Note that the core works for this thread."""
+    """Record that the core works for this thread."""
     _callers.add(threading.get_ident())
 
 
 def _works(frame: FrameType | None) -> bool:
-    """Whether a step, or a backward that may go through one, is on a stack."""
+    """Return whether a step, or a backward that may include one, is on a stack."""
     while frame is not None:
         if frame.f_code.co_filename.startswith((_OURS, *_BACKWARD)):
             return True

@@ -1,6 +1,6 @@
-"""Validation of arguments: each helper returns the checked value or says what is wrong with it.
+"""Validation of arguments: each helper returns the checked value or describes the error.
 
-`name` is the text that opens the message, for example "Material: `stretch`".
+`name` is the prefix of the message, for example "Material: `stretch`".
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _FLOAT64_BYTES = 8
 # Counts reach the core as 32-bit integers.
 LARGEST_COUNT = 2**31 - 1
 _LARGEST_SHOWN = 10**30
-# Integers are accepted where a float is meant; float16, bfloat16 and float32 widen without loss.
+# Integers are accepted as floats; float16, bfloat16 and float32 widen without loss.
 _PROMOTABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 
@@ -71,7 +71,7 @@ class Range(NamedTuple):
     closed: bool = False
 
     def outside(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Tell which values lie outside; NaN does."""
+        """Return a mask of values outside of the interval; NaN is outside."""
         if self.closed:
             inside = (values >= self.low) & (values <= self.high)
         else:
@@ -79,13 +79,13 @@ class Range(NamedTuple):
         return ~inside
 
     def holds(self, least: float, greatest: float) -> bool:
-        """Whether all numbers between two are inside; false for NaN."""
+        """Return whether all numbers between two are inside; false for NaN."""
         if self.closed:
             return self.low <= least and greatest <= self.high
         return self.low < least and greatest < self.high
 
     def __str__(self) -> str:
-        """Say the range in words, to follow "must be"."""
+        """Describe the range in words, to follow "must be"."""
         if math.isinf(self.low) and math.isinf(self.high):
             return "finite"
         if math.isinf(self.high):
@@ -101,7 +101,7 @@ LARGEST = 1e30
 SMALLEST = 1e-30
 
 OVERLAPPING = "overlapping"
-"""In place of pairs of surfaces that do not collide: those that overlap at the start."""
+"""Used instead of pairs of surfaces that do not collide: all pairs that overlap at the start."""
 
 ANY_NUMBER = Range()
 POSITIVE = Range(0.0)
@@ -111,13 +111,13 @@ UNIT_INTERVAL = Range(0.0, 1.0, closed=True)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """Mark an array of our own as read-only."""
+    """Mark an array as read-only; no caller may own it."""
     array.setflags(write=False)
     return array
 
 
 def refuse_gradient(name: str, value: object, instead: str) -> None:
-    """Refuse a tensor that is being differentiated where no derivative can flow."""
+    """Refuse a tensor that is being differentiated if no derivative is available."""
     if isinstance(value, Tensor) and has_derivative(value):
         raise InvalidInput(
             f"{name} must not require a gradient: none flows there; {instead} instead"
@@ -167,7 +167,7 @@ def _require_dense(name: str, value: Tensor) -> None:
 
 
 def _array(name: str, value: object, content: str) -> NDArray[Any]:
-    """Convert what NumPy reads as an array; refuse values that would lose information."""
+    """Convert array-like values; refuse values that would lose information."""
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(
             f"{name} must not be a masked array, as its mask would be lost; fill it first"
@@ -217,13 +217,13 @@ def check_finite(name: str, values: FloatArray) -> None:
 def check_range(name: str, values: FloatArray, accepted: Range) -> None:
     """Require finite numbers in a range; the message holds the first offending index.
 
-    What is positive must not be so small, and nothing so large, that powers of it leave the range
-    of float64.
+    Positive numbers must not be so small, and no number so large, that powers of them leave the
+    range of float64.
     """
     smallest = SMALLEST if accepted.low == 0.0 and not accepted.closed else -LARGEST
     if values.size == 0:
         return
-    # Each step checks all of its inputs: if nothing is wrong, two numbers show it.
+    # Each step checks all of its inputs: without an error, two numbers suffice.
     least, greatest = float(values.min()), float(values.max())
     if accepted.holds(least, greatest) and smallest <= least and greatest <= LARGEST:
         return
@@ -257,7 +257,7 @@ def check_count(name: str, value: object, minimum: int, maximum: int = LARGEST_C
         raise TypeError(f"{name} must be an integer, got {type(value).__name__}")
     count = int(value)
     if not minimum <= count <= maximum:
-        # Python writes out no integer of thousands of digits.
+        # Python does not print integers of thousands of digits.
         got = f"{count}" if abs(count) < _LARGEST_SHOWN else f"one of {count.bit_length()} bits"
         bound = f"at least {minimum}" if count < minimum else f"at most {maximum}"
         raise InvalidInput(f"{name} must be {bound}, got {got}")
@@ -282,9 +282,9 @@ def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
 
 
 def refuse_threads(name: str, workers: object) -> None:
-    """Refuse executors that run in this process: torch has one number of threads for all of them.
+    """Refuse executors with threads of this process: torch has one number of threads for all.
 
-    Nor do forward derivatives of torch know of other threads.
+    Forward derivatives of torch do not reach other threads either.
     """
     if isinstance(workers, ThreadPoolExecutor):
         raise InvalidInput(
@@ -324,7 +324,7 @@ def check_pairs(name: str, value: Any, accepted: Sequence[str]) -> tuple[tuple[s
 def check_ignored_pairs(
     name: str, value: Any, accepted: Sequence[str]
 ) -> tuple[tuple[str, str], ...] | str:
-    """Require pairs of two different accepted names, or the word for those that overlap."""
+    """Require pairs of two different accepted names, or the word for all pairs that overlap."""
     if isinstance(value, str):
         return check_choice(name, value, (OVERLAPPING,))
     return check_pairs(name, value, accepted)

@@ -1,9 +1,9 @@
-"""New tensors on the CPU, of float64 numbers unless a type is named, whatever torch's defaults are.
+"""New tensors on the CPU, float64 by default, independent of torch's defaults.
 
-`with torch.device(..)`, `torch.set_default_device` and `torch.set_default_dtype` act where torch
-makes a tensor without a device or a type. The package therefore makes all tensors here, with both.
-A default that is changed for the time of an operation would not reach backward and other threads,
-and would reach the functions of a caller, whose tensors follow the caller's defaults.
+`with torch.device(..)`, `torch.set_default_device` and `torch.set_default_dtype` affect tensors
+that torch makes without a device or a type. The package therefore makes all tensors here, with
+both. A temporary change of the defaults during an operation would not reach backward and other
+threads, and would affect the functions of a caller, whose tensors follow the caller's defaults.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def tensor(values: Any, *, dtype: torch.dtype = _F64) -> Tensor:
 
 
 def as_tensor(values: Any) -> Tensor:
-    """Return a tensor as it is, and anything else in the type that NumPy reads it in.
+    """Return a tensor unchanged, and other values in NumPy's type for them.
 
     Raises:
         TypeError: If NumPy reads no numbers.
-        ValueError: If it reads no rectangular array.
-        RuntimeError: If it is a list with tensors that require gradients.
+        ValueError: If NumPy reads no rectangular array.
+        RuntimeError: If the value is a list with tensors that require gradients.
     """
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values).copy())
 
@@ -72,7 +72,7 @@ def eye(size: int) -> Tensor:
 
 
 def arange(*ends: float, dtype: torch.dtype = _I64) -> Tensor:
-    """Count from one end (0 by default) to the other, and by a third number if there is one."""
+    """Count from one end (0 by default) to the other, by an optional third number."""
     return torch.arange(*ends, dtype=dtype, device=DEVICE)
 
 

@@ -23,20 +23,20 @@ __all__ = [
 
 
 class InvalidInput(ValueError):  # noqa: N818 - names of the public contract
-    """An argument has a wrong shape, value or name; the message names it and what is accepted."""
+    """An argument has a wrong shape, value or name; the message names it and accepted values."""
 
 
 class InadmissibleMaterial(InvalidInput):
-    """Numbers that are each in their range, but together belong to no material."""
+    """Numbers within their ranges that together describe no material."""
 
 
 class SimulationError(RuntimeError):
-    """The simulation itself failed; the state that it was given is unchanged.
+    """The simulation itself failed; the given state is unchanged.
 
     Attributes:
-        report: Report of the failed step, or None if no step was taken.
-        environments: Indices of the environments that failed in this way, (0,) without a
-            batch axis; `report.status` tells of all.
+        report: Report of the failed step, or None if no step was computed.
+        environments: Indices of the environments that failed in this way, (0,) without a batch
+            axis; `report.status` has the status of all.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class TurnedTooFar(SimulationError):  # noqa: N818
 
 
 class WorkerError(RuntimeError):
-    """The workers that computed a piece of work died, or missed its deadline, again and again."""
+    """The workers of a piece of work died, or missed its deadline, repeatedly."""
 
 
 class AddedMassWarning(UserWarning):
@@ -87,7 +87,7 @@ class BarrierStartWarning(UserWarning):
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
     """Warn at the line outside of the package, and of torch, that called it."""
     frame = sys._getframe(1)
-    level = 2  # of that frame
+    level = 2  # level of that frame
     while frame.f_back is not None and _is_inside(frame):
         frame = frame.f_back
         level += 1

@@ -1,4 +1,4 @@
-"""Packages that are in extras: imported on use, with an error that names the extra."""
+"""Packages of extras: imported on use, with an error that names the extra."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ __all__ = ["from_extra"]
 
 
 def from_extra(module: str, extra: str, use: str, instead: str = "") -> Any:
-    """Import a module of a package that is in an extra.
+    """Import a module of a package of an extra.
 
     Args:
-        module: Its name.
+        module: Name of the module.
         extra: Name of the extra.
         use: Opening of the message, such as "pictures need pyvista".
         instead: Another remedy than the installation.
 
     Raises:
-        InvalidInput: If it is not installed.
+        InvalidInput: If the package is not installed.
     """
     try:
         return import_module(module)

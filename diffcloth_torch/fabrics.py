@@ -1,26 +1,27 @@
-"""Starting points for real fabrics, from published measurements.
+"""Initial values for real fabrics, from published measurements.
 
 >>> sheet = dc.Cloth.grid((24, 24), material=dc.fabrics.material("denim", thickness=6e-4))
 
-The numbers are those of the database of H. Wang, J. F. O'Brien and R. Ramamoorthi, Data-Driven
-Elastic Models for Cloth: Modeling and Measurement, ACM Trans. Graph. 30(4), 71, 2011
-(graphics.berkeley.edu/papers/Wang-DDE-2011-08). It has, for each sample, the mass per area, the
+The numbers are from the database of H. Wang, J. F. O'Brien and R. Ramamoorthi, Data-Driven Elastic
+Models for Cloth: Modeling and Measurement, ACM Trans. Graph. 30(4), 71, 2011
+(graphics.berkeley.edu/papers/Wang-DDE-2011-08). For each sample it contains the mass per area, the
 stiffnesses c11, c22 and c33 of the law between tension and strain at small strain [N/m], and the
 bending stiffness k of hinges on lines at 0, 45 and 90 degrees to direction 1 at small curvature
-[N m]. With direction 2, which is the stiffer one of all samples, as the warp:
+[N m]. With direction 2, the stiffer one in all samples, as the warp:
 
     stretch = c22, stretch_weft = c11, stretch_shear = c33
     bending = k(0) / 4, bending_weft = k(90) / 4, bending_twill = k(45) / 4
 
-A line at 0 degrees bends direction 2. The factor is that between a plate and the energy
-k l^2 theta^2 / (8 A) of a hinge of length l and angle theta in two faces of area A, on a mesh of
-equilateral triangles. The database names neither the warp nor the measure of strain: with another
-one than stretch minus one, the stiffnesses of stretch would be up to twice as large.
+A line at 0 degrees bends direction 2. The factor 1/4 relates a plate to the energy k l^2 theta^2 /
+(8 A) of a hinge of length l and angle theta in two faces of area A, on a mesh of equilateral
+triangles. The database names neither the warp nor the measure of strain: with another measure than
+stretch minus one, the stiffnesses of stretch would be up to twice as large.
 
-These are starting points, not the fabric on your table. Real cloth stiffens as it is stretched,
-contracts sideways (c12, which has no counterpart here) and has hysteresis; samples of one name
-differ by more than any of these. What is not measured (Poisson ratio, damping, friction, thickness)
-has the defaults of `Material`. `dc.fit` finds the numbers of your own: see Identification.
+These are initial values, not your fabric. Real cloth stiffens as it is stretched, contracts
+sideways (c12, which has no counterpart here) and has hysteresis; samples of one name differ by more
+than any of these effects. Quantities that were not measured (Poisson ratio, damping, friction,
+thickness) have the defaults of `Material`. `dc.fit` estimates the numbers of your fabric: see
+Identification.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Measurement(NamedTuple):
     """A sample of the database.
 
     Attributes:
-        sample: Its name there.
+        sample: Name in the database.
         composition: Fibers and typical use.
         density: Mass per area [kg/m^2].
         tension: c11 and c22 [N/m].
@@ -111,7 +112,7 @@ MEASUREMENTS: Mapping[str, Measurement] = MappingProxyType(
         ),
     }
 )  # fmt: skip
-"""Name -> what was measured."""
+"""Name -> measurement."""
 
 
 def material(name: str, **changes: Any) -> Material:
@@ -119,7 +120,7 @@ def material(name: str, **changes: Any) -> Material:
 
     Args:
         name: One of `MEASUREMENTS`.
-        **changes: Fields of `Material` that are to be others.
+        **changes: Fields of `Material` to set to other values.
 
     Raises:
         InvalidInput: If the name is unknown, or a value is not accepted.

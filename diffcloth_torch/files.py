@@ -1,4 +1,4 @@
-"""Files: only regular ones are read; one that is replaced is replaced completely or not at all."""
+"""Files: only regular ones are read; a file is replaced completely or not at all."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ __all__ = [
 ]
 
 PART = ".part"
-"""End of the name of a file that is being written, and will replace another one."""
+"""Suffix of a file that is being written, and will replace another one."""
 
 INTEGER = re.compile(rb"[+-]?[0-9]+")
 """An integer in a text file. Python alone would also read 1_0 and digits of other scripts."""
 
 NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf)")
-"""A number in a text file, as C writes it."""
+"""A number in a text file, in the notation of C."""
 
 
 def as_path(name: str, value: object) -> Path:
@@ -46,7 +46,7 @@ def as_path(name: str, value: object) -> Path:
 def open_regular_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file to read.
 
-    Reading a pipe or a device, also behind a link, could wait forever.
+    Reading a pipe or a device, also through a link, could wait forever.
 
     Raises:
         InvalidInput: If it is not a regular file.
@@ -66,7 +66,7 @@ def open_regular_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def read_regular_file(path: Path, largest: int) -> bytes:
-    """Read a file whole; see `open_regular_file`.
+    """Read a whole file; see `open_regular_file`.
 
     Args:
         path: The file.
@@ -86,14 +86,14 @@ def read_regular_file(path: Path, largest: int) -> bytes:
 
 @contextmanager
 def replace_file(path: Path, *, keeps_ending: bool = False) -> Iterator[Path]:
-    """Yield a path to write to, which replaces `path` when all is written.
+    """Yield a path for writing; the file there replaces `path` at the end.
 
-    If the block fails, the file at `path` stays as it is, and nothing else is left.
+    If the block fails, the file at `path` is unchanged, and no other file is left.
 
     Args:
         path: The file.
-        keeps_ending: Whether the other path has the ending of `path`, for writers that choose a
-            format by it.
+        keeps_ending: If true, the other path has the ending of `path`, for writers that choose a
+            format by the ending.
 
     Raises:
         OSError: If it cannot be written; the message is a sentence.
@@ -103,18 +103,18 @@ def replace_file(path: Path, *, keeps_ending: bool = False) -> Iterator[Path]:
     try:
         with writing(path):
             yield part
-            with part.open("rb+") as file:  # before the name, so that a crash keeps either file
+            with part.open("rb+") as file:  # before the rename, so that a crash keeps either file
                 os.fsync(file.fileno())
             part.replace(path)
     except BaseException:
-        with suppress(OSError):  # the first error is the one that counts
+        with suppress(OSError):  # the first error is reported
             part.unlink(missing_ok=True)
         raise
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Name a file or folder in what the disk refuses in a block that writes it.
+    """Add the name of a file or folder to disk errors of a block that writes it.
 
     Raises:
         OSError: Of the class that the block raised; the message is a sentence.

@@ -1,4 +1,4 @@
-"""A lock of a folder: one process writes results into it."""
+"""A lock of a folder: only one process writes results into it."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from diffcloth_torch.files import PART, writing
 __all__ = ["LOCK", "locked"]
 
 LOCK = ".lock"
-"""Name of the file in a folder that is locked; it holds the process and the machine."""
+"""Name of the lock file in a folder; it contains the process and the machine."""
 
 
 @contextmanager
 def locked(owner: str, folder: Path) -> Iterator[None]:
-    """Make a folder, and keep other processes from using it for the time of a block.
+    """Make a folder, and keep other processes from using it during a block.
 
-    The lock ends with the process, however that ends. Files that a killed process has not finished
-    writing are removed.
+    The lock ends with the process, in every case. Unfinished files of a killed process are removed.
 
     Args:
-        owner: Opens messages.
+        owner: Prefix of messages.
         folder: The folder.
 
     Raises:
-        InvalidInput: If another process has it.
+        InvalidInput: If another process has the lock.
         OSError: If the folder cannot be made or written.
     """
     with writing(folder):
@@ -47,7 +46,7 @@ def locked(owner: str, folder: Path) -> Iterator[None]:
 
 
 def _acquired(owner: str, folder: Path) -> int:
-    """File descriptor of the lock of a folder."""
+    """Acquire the lock of a folder; return its file descriptor."""
     path = folder / LOCK
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -68,7 +67,7 @@ def _acquired(owner: str, folder: Path) -> int:
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
-    """Whether a file that was opened has not been removed by the holder before."""
+    """Return whether an open file still exists: its previous holder may have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The memory of the machine, against which counts are checked before anything is allocated."""
+"""The memory of the machine; counts are checked against it before anything is allocated."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ __all__ = ["check_memory"]
 
 
 def check_memory(name: str, count: int, each: int, of_what: str) -> int:
-    """Require a count of things that fit into the memory of the machine together.
+    """Require a count of objects that fit into the memory of the machine together.
 
     Args:
-        name: Opens the message.
-        count: Their number.
-        each: Bytes of one of them, at least.
-        of_what: Of them, such as "a state".
+        name: Prefix of the message.
+        count: Number of objects.
+        each: Smallest size of one of them [bytes].
+        of_what: Description of one of them, such as "a state".
 
     Raises:
         InvalidInput: If they do not fit.

@@ -1,4 +1,4 @@
-"""The operation of the package that a caller has called, whose name opens every message."""
+"""The operation of the package that a caller has called; its name begins every message."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CALLED: ContextVar[str] = ContextVar("operation")  # each thread has its own
 
 
 def operation(otherwise: str = "backward") -> str:
-    """Return the name of the operation that is at work.
+    """Return the name of the active operation.
 
     Args:
         otherwise: The name outside of all operations, where torch calls the package in backward.
@@ -25,16 +25,16 @@ def operation(otherwise: str = "backward") -> str:
 
 
 def label(argument: str, field: str) -> str:
-    """Open a message about a field of an argument, as "step: `control.pins`".
+    """Return the prefix of a message about a field of an argument, as "step: `control.pins`".
 
-    The method that is named like the argument has the fields as arguments: "control: `pins`".
+    The method with the name of the argument has the fields as arguments: "control: `pins`".
     """
     name = operation()
     return f"{name}: `{field}`" if name == argument else f"{name}: `{argument}.{field}`"
 
 
 def called(name: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Name an operation while it works; a public one that it calls has its own name."""
+    """Name an operation while it is active; a public one that it calls has its own name."""
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         @wraps(function)

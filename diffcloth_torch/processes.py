@@ -1,7 +1,8 @@
-"""Worker processes on this machine: pieces of work with a deadline, repeated where a worker dies.
+"""Worker processes on this machine: pieces of work with a deadline, repeated if a worker dies.
 
-Executors of `concurrent.futures` wait without end for a worker that has stopped, and leave their
-workers behind if this process is killed. The workers of a `Pool` end with it, see `worker`.
+Executors of `concurrent.futures` wait forever for a worker that has stopped, and leave their
+workers behind if this process is killed. The workers of a `Pool` end with this process, see
+`worker`.
 """
 
 from __future__ import annotations
@@ -54,14 +55,14 @@ class _Process:
     """A worker process, and the piece that it computes.
 
     Attributes:
-        piece: Index of the piece; None if it computes none.
-        ready: Whether it has started.
+        piece: Index of the piece; None if there is none.
+        ready: True if the process has started.
     """
 
     def __init__(self, deadline: float) -> None:
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            # Messages are larger than what a socket holds: a worker that has stopped must not
+            # Messages are larger than the buffer of a socket: a worker that has stopped must not
             # block this process.
             limit = struct.pack("ll", *divmod(int(1e6 * deadline) + 1, 1_000_000))
             for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
@@ -70,8 +71,8 @@ class _Process:
             path = str(Path(__file__).parents[1])
             flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
             code = _BOOT.format(path=path, arguments=arguments)
-            # Ctrl-C reaches all processes of a terminal: this one ends its workers. They inherit
-            # the mask.
+            # Ctrl-C reaches all processes of a terminal, but only this one ends its workers, which
+            # inherit the mask.
             mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
             try:
                 self._process = subprocess.Popen(
@@ -92,12 +93,12 @@ class _Process:
 
     @property
     def is_idle(self) -> bool:
-        """Whether it waits for a piece."""
+        """Return whether the process waits for a piece."""
         return self.ready and self.piece is None
 
     @property
     def seconds_left(self) -> float:
-        """Time until its deadline."""
+        """Time until the deadline of the piece."""
         longest = self._deadline if self.ready else _LONGEST_START
         return self.since + longest - time.monotonic()
 
@@ -107,13 +108,13 @@ class _Process:
         self.connection.send_bytes(message)
 
     def end(self) -> int:
-        """Kill it if it runs, and return its exit code; minus the signal that ended it."""
+        """Kill a running process; return its exit code, or minus the signal that ended it."""
         self.connection.close()
         self._process.kill()
         return self._process.wait()
 
     def fate(self) -> str:
-        """End it, and report why it gave no answer."""
+        """End the process, and return the reason for its missing answer."""
         if self.seconds_left <= 0:
             self.end()
             if not self.ready:
@@ -128,13 +129,13 @@ class _Process:
 
 
 class Pool:
-    """Worker processes; they end with `close`, and with this process however it ends."""
+    """Worker processes, which end with `close`, and in every case with this process."""
 
     def __init__(self, name: str, count: int, deadline: float) -> None:
         """Prepare to start processes.
 
         Args:
-            name: Of the pool, in messages.
+            name: Name of the pool in messages.
             count: Number of processes.
             deadline: Longest time of a piece, or between two of its calls of
                 `worker.note_progress` [s].
@@ -144,10 +145,10 @@ class Pool:
         weakref.finalize(self, _end, self._processes)
 
     def map(self, function: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
-        """Results in the order of the items.
+        """Yield results in the order of the items.
 
         Raises:
-            WorkerError: If the processes of a piece die or miss its deadline again and again.
+            WorkerError: If the processes of a piece die or miss its deadline repeatedly.
         """
         work = _Work(self._name, function, items)
         try:
@@ -159,7 +160,7 @@ class Pool:
                     raise error from (RuntimeError(f"in a worker:\n{text}") if text else None)
                 yield value
         finally:
-            # Nobody waits for the pieces that are left.
+            # The remaining pieces are not needed.
             self._end([p for p in self._processes if p.piece is not None])
 
     def close(self) -> None:
@@ -208,7 +209,7 @@ class _Work:
     """The pieces of a call of `map`.
 
     Attributes:
-        waiting: Indices of pieces that no process computes.
+        waiting: Indices of pieces without a process.
         answers: Index of a piece -> its result, its error and the traceback of the error.
     """
 
@@ -219,11 +220,11 @@ class _Work:
         self._losses: dict[int | None, int] = {}
 
     def message(self, piece: int) -> bytes:
-        """The bytes that a worker gets."""
+        """Return the bytes of a piece for a worker."""
         return pickle.dumps((self._function, self._items[piece]))
 
     def lose(self, piece: int | None, fate: str) -> None:
-        """Repeat a piece whose process was lost, or give it up; None for a process without one."""
+        """Repeat a piece whose process was lost, or give up; None for a process without a piece."""
         self._losses[piece] = self._losses.get(piece, 0) + 1
         is_last = self._losses[piece] > _REPEATS
         if piece is None:

@@ -19,7 +19,7 @@ _LINE = 88
 
 
 def value_text(value: object) -> str:
-    """A value in a few words; `(grad)` follows a tensor that requires a gradient."""
+    """Short text of a value; `(grad)` follows a tensor that requires a gradient."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Tensor):

@@ -1,7 +1,7 @@
-"""A worker process of `processes.Pool`: it computes pieces, and ends with its parent process.
+"""A worker process of `processes.Pool`: computes pieces, and ends with its parent process.
 
-The module imports the standard library alone: a worker watches its parent before it imports torch,
-which takes seconds.
+The module imports only the standard library: a worker must watch its parent before it imports
+torch, which takes seconds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 
 __all__ = ["end_with_parent", "main", "note_progress", "portable"]
 
-_PAUSE = 0.2  # seconds between two looks at the parent
+_PAUSE = 0.2  # seconds between two checks of the parent
 _BETWEEN_SIGNS = 0.5  # seconds between two signs of progress
 _PARENT_DIED = 1  # exit code
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -29,20 +29,20 @@ _last_sign = 0.0
 
 
 def end_with_parent(parent: int, *, by_signal: bool = False) -> None:
-    """End this process soon after its parent process has ended, however the parent ended.
+    """End this process soon after its parent process has ended for any reason.
 
-    A thread compares the number of the parent process. A pipe to the parent would not do: a process
-    that the parent forks holds the pipe open.
+    A thread compares the number of the parent process. A pipe to the parent would not suffice: a
+    process that the parent forks keeps the pipe open.
 
     Args:
         parent: Number of the parent process.
-        by_signal: Whether the kernel sends SIGKILL, too, which ends even a process that is stopped.
-            The kernel sends it when the thread ends that started this process, so that this must
-            be the main thread of the parent.
+        by_signal: If true, the kernel also sends SIGKILL, which ends even a stopped process. The
+            kernel sends it when the thread ends that started this process, so that this must be the
+            main thread of the parent.
     """
     if by_signal:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL))
-    if os.getppid() != parent:  # it ended before
+    if os.getppid() != parent:  # the parent ended before
         os._exit(_PARENT_DIED)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
@@ -54,7 +54,7 @@ def _watch(parent: int) -> None:
 
 
 def note_progress() -> None:
-    """Begin the deadline of the piece of this worker anew; in other processes it does nothing."""
+    """Restart the deadline of the piece of this worker; in other processes, do nothing."""
     global _last_sign
     if _parent is not None and time.monotonic() > _last_sign + _BETWEEN_SIGNS:
         _last_sign = time.monotonic()
@@ -62,10 +62,10 @@ def note_progress() -> None:
 
 
 def portable(error: Exception) -> Exception:
-    """The error, or its text if it cannot be pickled and read again."""
+    """Return the error, or its text if it cannot be pickled and read again."""
     try:
         copy = pickle.loads(pickle.dumps(error))
-    except Exception:  # any that a class with arguments of its own raises
+    except Exception:  # any error of a class with arguments of its own
         copy = None
     if type(copy) is type(error):
         return error
@@ -84,8 +84,8 @@ def main(descriptor: int, parent: int, by_signal: int) -> None:
     global _parent
     end_with_parent(parent, by_signal=bool(by_signal))
     _parent = Connection(descriptor)
-    # As processes of `multiprocessing` that are spawned: the main module of the parent is imported,
-    # and one that would start workers while it is imported is refused.
+    # As for spawned processes of `multiprocessing`: the main module of the parent is imported, and
+    # a main module that would start workers during its import is refused.
     process = multiprocessing.current_process()
     process._inheriting = True  # type: ignore[attr-defined]
     spawn.prepare(pickle.loads(_parent.recv_bytes()))
@@ -100,7 +100,7 @@ def main(descriptor: int, parent: int, by_signal: int) -> None:
 
 
 def _answer(piece: bytes) -> bytes:
-    """Compute a piece; an error and its traceback are an answer, too."""
+    """Compute a piece; an error and its traceback are answers as well."""
     try:
         function, item = pickle.loads(piece)
         return pickle.dumps((function(item), None, ""))

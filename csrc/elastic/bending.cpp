@@ -19,7 +19,7 @@ Mat3 second_derivatives(const Element& element, const double* x) {
   return Y;
 }
 
-/// The same of x1 - x0.
+/// The second derivatives of x1 - x0.
 Mat3 second_derivatives_change(const Element& element, const double* x0, const double* x1) {
   const Index v0 = element.vertices[0];
   const Vec3 origin = row(x1, v0) - row(x0, v0);
@@ -75,7 +75,8 @@ Mat3 geometric_torque(const Element& element, const BodyState& state) {
   return T;
 }
 
-/// Change of frame_stress() (in the fixed frame R) along K_v, less what the change of q does.
+/// Change of frame_stress() (in the fixed frame R) along K_v, without the contribution of the change of
+/// q.
 Mat32 frame_stress_geometric(const BodyState& state,
                              const Mat3& torque,
                              const Mat32& K_v,
@@ -125,8 +126,8 @@ void scatter(const Element& element, const Mat3& Y_bar, const Mat32& F_bar, doub
   }
 }
 
-/// c_i += Y_bar^T x_i, g_p += F_bar^T x_p, with x relative to the first vertex (the weights and the
-/// gradients sum to zero, so that an offset has no effect).
+/// c_i += Y_bar^T x_i, g_p += F_bar^T x_p, with x relative to the first vertex (weights and gradients
+/// sum to zero, so that an offset has no effect).
 void scatter_geometry(const Element& element,
                       const Mat3& Y_bar,
                       const Mat32& F_bar,
@@ -212,8 +213,8 @@ ScalarBars constant_mixed(const Element& element,
   return result;
 }
 
-// By body_state(), d phi = <q, R^T dY - db> - tau . w. Where b = 0 the frame drops out, as it does in
-// energy(), but not of the derivative by b.
+// By body_state(), d phi = <q, R^T dY - db> - tau . w. If b = 0, the frame drops out, as in energy(),
+// but not from the derivative by b.
 ScalarBars energy_bars(Element element,
                        FormDerivatives derivatives,
                        const double* x,
@@ -241,9 +242,9 @@ ScalarBars energy_bars(Element element,
 }
 
 // phi = z . grad E = weight [ <s Q, ds> + damping <s_n Q, ds_n> ] with ds the change of s along z:
-// ds = R^T Y(z) - w x b. By symmetry of second derivatives, the gradient of phi with respect to
-// (Y, F) is the change of (dE/dY, dE/dF) along z, and that with respect to (Y(z), F(z)) is
-// (dE/dY, dE/dF). What depends on b: db -> -dq . db + (w x q) . db.
+// ds = R^T Y(z) - w x b. By symmetry of second derivatives, the gradient of phi with respect to (Y, F)
+// is the change of (dE/dY, dE/dF) along z, and the gradient with respect to (Y(z), F(z)) is (dE/dY,
+// dE/dF). The terms that depend on b: db -> -dq . db + (w x q) . db.
 ScalarBars mixed(const Element& element,
                  FormDerivatives derivatives,
                  const double* x,
@@ -266,7 +267,7 @@ ScalarBars mixed(const Element& element,
     result.form[k] = element.weight * (s * derivatives[k]).cwiseProduct(change.ds).sum();
   }
   if (x_n != nullptr) {
-    // Also where the damping is zero, whose derivative is not.
+    // Also if the damping is zero, as its derivative is not.
     const Mat3 s_n = state.curvature - *element.b_n;
     const Mat3 ds_n = change.ds + cross_columns(change.w, *element.b - *element.b_n);
     const double work_n = (s_n * Q).cwiseProduct(ds_n).sum();
@@ -336,8 +337,8 @@ void add_constant_tangent(const Element& element, const double* u, const Tangent
   }
 }
 
-// As in body_change(), with the changes of c and g in the place of those of x, and those of b, b_n and
-// Q besides.
+// As in body_change(), with the changes of c and g instead of the changes of x, and additionally the
+// changes of b, b_n and Q.
 void add_tangent(
     const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y) {
   const bool with_rest = dot.c != nullptr;

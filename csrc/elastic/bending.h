@@ -9,19 +9,19 @@
 
 namespace diffcloth::elastic::bending {
 
-/// One bending element. With the second derivatives Y_ab = sum_i c_ab,i x_i and the frame R(x) of
-/// the base triangle, its curvature in the frame it carries along is R^T Y, and
+/// One bending element. With the second derivatives Y_ab = sum_i c_ab,i x_i and the frame R(x) of the
+/// base triangle, its curvature in this frame is R^T Y, and
 ///
 ///   E = weight / 2 [ <s Q, s> + damping <s_n Q, s_n> ],   s = R^T Y - b,  s_n = R^T Y - b_n,
 ///
-/// Q a form of bending_form.h, b the rest curvature and b_n the curvature at the start of the step: both terms
-/// are exactly invariant under rigid motion. Where b = 0 and damping = 0 the energy is quadratic in x. In a
-/// hinge only the row uu is not zero, and nu has no effect.
+/// Q a form of bending_form.h, b the rest curvature and b_n the curvature at the start of the step: both
+/// terms are exactly invariant under rigid motion. If b = 0 and damping = 0, the energy is quadratic in
+/// x. In a hinge only the row uu is not zero, and nu has no effect.
 struct Element {
   std::span<const Index> vertices;  ///< the base triangle first
   const double* c;                  ///< 3 a vertex: c_uu, c_uv, c_vv [1/m^2]
-  const mesh::ShapeGradient* g;     ///< of the base triangle
-  double weight;                    ///< D A [N m^3], or A [m^2] where D is in the form
+  const mesh::ShapeGradient* g;     ///< shape gradient of the base triangle
+  double weight;                    ///< D A [N m^3], or A [m^2] if the form contains D
   Mat3 form;                        ///< Q
   double damping;                   ///< k_d / h [-]
   const Mat3* b;                    ///< rest curvature [1/m]
@@ -32,7 +32,7 @@ struct Element {
   Index size() const { return static_cast<Index>(vertices.size()); }
 };
 
-/// Curvature R^T Y in the frame that the base triangle carries along.
+/// Curvature R^T Y in the frame of the base triangle.
 Mat3 body_curvature(const Element& element, const double* x);
 
 /// Energy without damping.
@@ -40,27 +40,27 @@ double energy(const Element& element, const double* x);
 
 // The energy of elements that are not flat, its gradient and its Hessian are in bending_lanes.h.
 
-/// Energy of a flat element at x1 minus that at x0, from differences of positions.
+/// Energy of a flat element at x1 minus its energy at x0, from differences of positions.
 double flat_energy_change(const Element& element, const double* x0, const double* x1);
 
 /// g += the gradient of a flat element.
 void add_flat_gradient(const Element& element, const double* x, double* g);
 
-/// constant[slot] += weight c_i^T Q c_j: the Hessian of a flat element is this times I, and that of another one,
-/// without damping, has this much of I.
+/// constant[slot] += weight c_i^T Q c_j: times I, this is the Hessian of a flat element, and the part of
+/// the Hessian of other elements, without damping, that is a multiple of I.
 void add_constant(const Element& element, std::span<const Index> slots, double* constant);
 
 /// y += H z.
 void add_hessian_product(const Element& element, const double* x, const double* z, double* y);
 
-/// Derivatives of the form of an element by the numbers that it is made of, at most four.
+/// Derivatives of the form of an element by its parameters, at most four.
 using FormDerivatives = std::span<const Mat3>;
 
 /// Cotangents of the parameters of an element for phi = z . grad E.
 struct ScalarBars {
   double weight = 0.0;
   double damping = 0.0;
-  std::array<double, 4> form{};  ///< of the numbers of the form
+  std::array<double, 4> form{};  ///< cotangents of the parameters of the form
 };
 
 /// Cotangents for phi = weight <Y(u) Q, Y(z)>, the form of add_constant(); c_bar may be null.
@@ -70,15 +70,15 @@ ScalarBars constant_mixed(const Element& element,
                           const double* z,
                           double* c_bar);
 
-/// Where the cotangents of the geometry of an element are added. Null pointers are skipped.
+/// Destinations of the cotangents of the geometry of an element. Null pointers are skipped.
 struct GeometryBars {
   double* c = nullptr;               ///< 3 a vertex
-  mesh::ShapeGradient* g = nullptr;  ///< of the base triangle
+  mesh::ShapeGradient* g = nullptr;  ///< gradient of the base triangle
   Mat3* b = nullptr;
   double* x_n = nullptr;  ///< [N, 3]
 };
 
-/// Cotangents for phi = seed E, without damping; bars.x_n stays as it is.
+/// Cotangents for phi = seed E, without damping; bars.x_n is unchanged.
 ///
 /// @param x_bar  += d phi / dx, [N, 3]
 ScalarBars energy_bars(Element element,
@@ -88,7 +88,7 @@ ScalarBars energy_bars(Element element,
                        const GeometryBars& bars,
                        double* x_bar);
 
-/// @param x_n  start of the step, or null where there is none (then element.b_n is not read)
+/// @param x_n  start of the step, or null if there is none (element.b_n is then not read)
 ScalarBars mixed(const Element& element,
                  FormDerivatives derivatives,
                  const double* x,
@@ -101,14 +101,14 @@ struct Tangents {
   double weight = 0.0;
   double damping = 0.0;
   Mat3 form = Mat3::Zero();
-  const double* c = nullptr;               ///< 3 a vertex; with it g and b
-  const mesh::ShapeGradient* g = nullptr;  ///< of the base triangle
+  const double* c = nullptr;               ///< 3 a vertex; if given, g and b are as well
+  const mesh::ShapeGradient* g = nullptr;  ///< gradient of the base triangle
   const Mat3* b = nullptr;
   const double* x_n = nullptr;  ///< [N, 3]
 };
 
 /// y += the change of weight Y(u) Q with these tangents, over the element: constant_mixed(), transposed;
-/// of the geometry c alone.
+/// tangents of the geometry are limited to c.
 void add_constant_tangent(const Element& element, const double* u, const Tangents& dot, double* y);
 
 /// y += the change of grad E with these tangents: mixed(), transposed.

@@ -14,13 +14,13 @@ struct Slots;
 struct BendingBatches {
   std::vector<BendingBatch> batches;
   std::vector<BendingPoint> points;
-  std::vector<Index> elements;  ///< of the batches, in their order
+  std::vector<Index> elements;  ///< elements of the batches, in their order
 };
 
-/// Those elements, sorted by how many vertices they have.
+/// Batches of elements, sorted by number of vertices. put_start_curvatures() sets the curvature at the start
+/// of the step.
 ///
-/// @param model  with the numbers of its elements in `prepared`
-/// The curvature at the start of the step is put by put_start_curvatures().
+/// @param model  with the quantities of its elements in `prepared`
 BendingBatches bending_batches(const Model& model, const Slots& slots, std::vector<Index> elements);
 
 /// @param curvatures  [B] of all elements

@@ -15,7 +15,7 @@ Mat3 to_material_axes(const Vec2& axis) {
   return T;
 }
 
-/// A form on (aa, ab, bb), on (uu, uv, vv).
+/// Transform a form on (aa, ab, bb) into a form on (uu, uv, vv).
 Mat3 in_rest_frame(const Vec2& axis, double aa, double bb, double both, double ab) {
   Mat3 Q;
   Q << aa, 0.0, both, 0.0, ab, 0.0, both, 0.0, bb;

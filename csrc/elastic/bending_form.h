@@ -22,8 +22,8 @@ Mat3 isotropic_form_derivative();
 ///
 ///   D_w cos^4 phi + D_f sin^4 phi + (4 D_t - D_w - D_f) cos^2 phi sin^2 phi:
 ///
-/// D_t of one bent along the twill, at 45 degrees. Where the three are equal the form is D times the
-/// isotropic one.
+/// D_t if it is bent along the twill, at 45 degrees. If the three are equal, the form is D times the
+/// isotropic form.
 struct Plate {
   double warp;     ///< D_w [N m]
   double weft;     ///< D_f [N m]
@@ -37,8 +37,8 @@ struct Plate {
 /// [N m]
 Mat3 plate_form(const Plate& plate);
 
-/// Derivatives of plate_form() by D_w, D_f, D_t and nu. Where D_w and D_f are both zero, the root has no
-/// derivative; half a derivative each is what equal changes of both give.
+/// Derivatives of plate_form() by D_w, D_f, D_t and nu. If D_w and D_f are both zero, the root has no
+/// derivative; half of its derivative along equal changes of both is assigned to each.
 std::array<Mat3, 4> plate_form_derivatives(const Plate& plate);
 
 }  // namespace diffcloth::elastic

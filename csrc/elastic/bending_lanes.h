@@ -7,38 +7,37 @@
 
 namespace diffcloth::elastic {
 
-// Plain arrays: those of the standard library are templates, see linalg/dense_kernels_impl.h.
+// Plain arrays: standard library arrays are templates, see linalg/dense_kernels_impl.h.
 // NOLINTBEGIN(modernize-avoid-c-arrays)
 
-/// Bending elements that go through the arithmetic side by side.
+/// Number of bending elements that are processed side by side.
 inline constexpr int kBendingLanes = 8;
 
 /// The i-th vertices of eight elements.
 struct BendingPoint {
   std::int32_t vertex[kBendingLanes];
-  std::int32_t slot[3][kBendingLanes];  ///< of its blocks with base corners up to itself
-  std::int64_t
-      above[3][kBendingLanes];  ///< -1 where these lie transposed in the lower triangle, else 0
-  double c[3][kBendingLanes];   ///< c_uu, c_uv, c_vv [1/m^2]
+  std::int32_t slot[3][kBendingLanes];   ///< slots of its blocks with base corners up to itself
+  std::int64_t above[3][kBendingLanes];  ///< -1 if transposed, else 0
+  double c[3][kBendingLanes];            ///< c_uu, c_uv, c_vv [1/m^2]
 };
 
-/// Eight elements of as many vertices each, or fewer: the lanes behind the last one repeat it, without
-/// weight. See bending.h for the notation.
+/// Up to eight elements with equal numbers of vertices: unused lanes repeat the last element with weight
+/// zero. See bending.h for the notation.
 struct BendingBatch {
-  std::int32_t size;              ///< lanes that count
+  std::int32_t size;              ///< number of used lanes
   std::int32_t points;            ///< vertices of an element
-  std::int32_t first;             ///< of the batch's points
+  std::int32_t first;             ///< index of the batch's first point
   double g[4][kBendingLanes];     ///< shape gradients of corners 1 and 2 of the base triangle [1/m]
   double Q[6][kBendingLanes];     ///< lower triangle of weight Q, row by row
   double damping[kBendingLanes];  ///< k_d / h [-]
   double b[9][kBendingLanes];     ///< column by column [1/m]
-  double b_n[9][kBendingLanes];   ///< likewise; zero where there is no damping
+  double b_n[9][kBendingLanes];   ///< likewise; zero without damping
 };
 
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// The bending of many elements that are not flat, E of bending.h, in lanes. As StretchKernels, with the
-/// same bits at every level.
+/// The bending of many elements that are not flat, E of bending.h, in lanes. As in StretchKernels, all
+/// levels have the same bits.
 struct BendingKernels {
   /// E(x1) - E(x0) from differences of positions, summed in the order of the elements.
   ///
@@ -58,17 +57,17 @@ struct BendingKernels {
                        double* g);
 
   /// blocks += the Hessian without its multiples of the identity,  (1 + damping) c_i^T Q c_j I  with the
-  /// weight in Q, or Gauss-Newton's. With the derivative A_j = d omega / d x_j of the frame's rotation, zero
-  /// beyond the base triangle, it has the blocks
+  /// weight in Q, or the Gauss-Newton matrix. With the derivative A_j = d omega / d x_j of the frame's
+  /// rotation, zero beyond the base triangle, the Hessian has the blocks
   ///
   ///   H_ij = [m_i]x A_j - A_i^T [m_j]x + A_i^T (tr(M) I - M) A_j + D_ij,
   ///   m_i = R (b + damping b_n) Q c_i,   M = R [ (b Q + q) b^T + (damping b_n Q + q_n) b_n^T ] R^T,
   ///
-  /// where q and q_n are the work conjugates of s and s_n in the body frame and D_ij is what the change of
-  /// the rotation itself adds, see rotation_change_adjoint() in frame.h. Gauss-Newton's is without q, q_n and
-  /// D_ij.
+  /// where q and q_n are the work conjugates of s and s_n in the body frame, and D_ij is the
+  /// contribution of the change of the rotation itself, see rotation_change_adjoint() in frame.h. The
+  /// Gauss-Newton matrix omits q, q_n and D_ij.
   ///
-  /// @param place  where a slot lies in blocks
+  /// @param place  index of each slot in blocks
   void (*add_hessian)(const BendingBatch* batches,
                       std::size_t count,
                       const BendingPoint* points,
@@ -78,7 +77,7 @@ struct BendingKernels {
                       double* blocks);
 };
 
-/// @throws std::invalid_argument  where this processor or build has none of that level
+/// @throws std::invalid_argument  if this processor or build has no kernels of that level
 const BendingKernels& bending_kernels(linalg::KernelLevel level);
 
 }  // namespace diffcloth::elastic

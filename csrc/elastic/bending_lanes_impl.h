@@ -163,7 +163,7 @@ DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
 struct BendingMotion {
   Shape start;
   Shape end;
-  Lanes<9> change;  ///< of Y
+  Lanes<9> change;  ///< change of Y
 };
 
 DIFFCLOTH_INLINE void gather_motion(const BendingBatch& batch,
@@ -354,13 +354,13 @@ double energy_change(const BendingBatch* batches,
   return total;
 }
 
-/// What the Hessians of eight elements are made of; vectors are in the body frame unless they say otherwise.
+/// Intermediate results for the Hessians of eight elements; vectors are in the body frame unless noted.
 struct Parts {
   Lanes<9> R;
   Lanes<9> bQ;  ///< (b + damping b_n) Q
   Lanes<9> bQ_world;
   Lanes<9> C;      ///< tr(M) I - M of bending_lanes.h
-  Lanes<6> g;      ///< of the corners p, two each
+  Lanes<6> g;      ///< shape gradients of the corners p, two each
   Lanes<6> h;      ///< S^-1 g_p
   Lanes<3> gamma;  ///< g_p . rho with rho = S^-1 (-tau_2, tau_1)
   Lanes<3> eta;    ///< h_p . (tau_1, tau_2)
@@ -445,7 +445,7 @@ DIFFCLOTH_INLINE Vector moment(const Lanes<9>& bQ, const BendingPoint& point, in
 /// A block of the Hessian column by column.
 using Block = double[9][kLanes];
 
-/// Of corners i and j of the base triangle.
+/// Block of corners i and j of the base triangle.
 DIFFCLOTH_INLINE void base_block(
     const Parts& parts, const BendingPoint* corners, int i, int j, bool positive, Block& block) {
   const double exact = positive ? 0.0 : 1.0;
@@ -472,7 +472,7 @@ DIFFCLOTH_INLINE void base_block(
     M[2][0] = m_j.at[2] * hi[0];
     M[2][1] = m_j.at[2] * hi[1];
     M[2][2] = corner_i + corner_j;
-    // A_i^T C A_j: rows and columns of C that A has.
+    // A_i^T C A_j: only the rows and columns of C where A is not zero.
     const Matrix C = matrix_at(parts.C.at, l);
     double CA[3][3];
     for (int k = 0; k < 3; ++k) {
@@ -519,8 +519,8 @@ DIFFCLOTH_INLINE void base_block(
   }
 }
 
-/// Hessian blocks [m]x A_j, in world axes, between an outer vertex and corner j of the base triangle. Their sum is
-/// zero.
+/// Hessian blocks [m]x A_j, in world axes, between an outer vertex and corner j of the base triangle.
+/// Their sum is zero.
 DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
                                    const BendingPoint& point,
                                    Block (&blocks)[3]) {
@@ -541,10 +541,11 @@ DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
   }
 }
 
-/// The blocks of the base triangle with its first corner, as all that are in one row of the Hessian add to zero.
+/// Compute the blocks of the base triangle with its first corner: the blocks in each row of the Hessian
+/// sum to zero.
 ///
-/// @param rows   lower triangle of the base triangle, of which the blocks of corners 1 and 2 are known
-/// @param outer  sum of the blocks of all vertices beyond it with each corner
+/// @param rows   lower triangle of the base triangle; the blocks of corners 1 and 2 are known
+/// @param outer  sum of the blocks of all vertices beyond the base triangle with each corner
 DIFFCLOTH_INLINE void complete_rows(const Block (&outer)[3], Block (&rows)[6]) {
   for (int l = 0; l < kLanes; ++l) {
     for (int b = 0; b < 3; ++b) {

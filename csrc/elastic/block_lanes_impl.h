@@ -17,7 +17,7 @@ constexpr int kBlockLanes = 8;
 using Pack = double __attribute__((vector_size(8 * kPack)));
 using StoredPack = double __attribute__((vector_size(8 * kPack), aligned(8), may_alias));
 
-/// Transpose as many packs as each has numbers.
+/// Transpose a square of packs: as many packs as each has numbers.
 template <class V, int Size>
 DIFFCLOTH_INLINE void transpose(V (&v)[Size]) {
   if constexpr (Size == 8) {
@@ -76,10 +76,10 @@ DIFFCLOTH_INLINE void transpose_blocks(const std::int64_t (&which)[kBlockLanes],
   }
 }
 
-/// Add a block of each element, column by column, at its place in `blocks`.
+/// Add a block of each element, column by column, at its index in `blocks`.
 ///
 /// @param slot  of each element's block
-/// @param size  elements that count
+/// @param size  number of used lanes
 DIFFCLOTH_INLINE void add_blocks(const double (*h)[kBlockLanes],
                                  const std::int32_t (&slot)[kBlockLanes],
                                  int size,

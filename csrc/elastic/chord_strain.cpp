@@ -33,7 +33,7 @@ struct ChordStrain::Face {
   Law law;
   double weight;  ///< k A
 
-  /// The change of e with one of G.
+  /// The change of e along a change Z of G.
   Mat2 change(const Mat32& Z) const { return symmetric_part(Z.transpose() * D); }
 
   /// dE/dG.

@@ -8,17 +8,18 @@
 
 namespace diffcloth::elastic {
 
-/// Resistance to strain that a displacement d adds to faces which a step turns:
+/// Resistance to the strain that a displacement d adds to faces which a step turns:
 ///
 ///   E(x) = sum_faces k A phi(|e|^2),   e = sym(F(x - c)^T F(d)),   phi(q) = 1/2 q^2 / (q + q_0),
 ///
-/// k the mean stiffness of a face, A its area. The faces at x have the strain of those at x - d and e, if the strain
-/// rate of d is zero at c - d / 2. E is convex; below strains of sqrt(q_0) it is of fourth order, so that smooth motion
-/// does not feel it.
+/// k the mean stiffness of a face, A its area. The strain of the faces at x is their strain at x - d
+/// plus e, if the strain rate of d is zero at c - d / 2. E is convex; below strains of sqrt(q_0) it is
+/// of fourth order, so that smooth motion does not feel it.
 class ChordStrain final : public Potential {
  public:
-  /// @param elastic  of the model, whose cotangents and tangents count here, too; outlives this
-  /// @param shift    d, the cloths' vertices at least, from the first use on; outlives this
+  /// @param elastic  potential of the model, to whose cotangents and tangents this one adds; outlives
+  ///                 this
+  /// @param shift    d, at least for the cloths' vertices, from the first use on; outlives this
   /// @param center   c, likewise
   ChordStrain(ElasticPotential& elastic, const double* shift, const double* center);
 
@@ -53,7 +54,7 @@ class ChordStrain final : public Potential {
   const Model& model_;
   const double* shift_;
   const double* center_;
-  mutable std::vector<Constants> constants_;  ///< of all faces; empty until asked for
+  mutable std::vector<Constants> constants_;  ///< constants of all faces; empty until first used
 };
 
 }  // namespace diffcloth::elastic

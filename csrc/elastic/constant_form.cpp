@@ -7,16 +7,16 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// 1 + k_d/h of a face: damping resists a change over the step like stretch resists it from rest.
+/// 1 + k_d/h of a face: damping resists a change over the step as stretch resists a change from rest.
 double face_factor(const Model& model, Index f) {
   return model.damping[f] == 0.0 ? 1.0 : 1.0 + model.damping[f] / model.h;
 }
 
 double element_factor(const Model& model, Index e) { return 1.0 + model.prepared->damping[e]; }
 
-/// F diag(k_w, k_f) in material axes: the warp resists what its own yarns do, the weft likewise. Shear
-/// adds nothing, which leaves L linear in the stiffnesses; where it is no stiffer than the yarns, the
-/// Hessian stays below L.
+/// F diag(k_w, k_f) in material axes: warp and weft each resist changes of their own yarns. Shear adds
+/// nothing, so that L is linear in the stiffnesses; if shear is no stiffer than the yarns, the Hessian
+/// stays below L.
 Mat32 constant_stress(const Weave& k, const Mat32& F) {
   const Mat2 Q = k.axes();
   return F * Q * Vec2(k.warp, k.weft).asDiagonal() * Q.transpose();
@@ -59,7 +59,7 @@ void add_constant_mixed(
   scatter_gradient_bar(model, f, k_s * area * factor * F_u, z, g_bar);
 }
 
-/// @param damped  whether damping counts
+/// @param damped  true to include damping
 void add_element_mixed(const Model& model,
                        Index e,
                        bool damped,
@@ -246,7 +246,7 @@ void ConstantForm::add_spring(const Springs& springs, Index a) {
       const double twice = points[p] == points[q] && p != q ? 2.0 : 1.0;
       own_values_[pattern_->slot(points[p], points[q])] += twice * k * b[p] * b[q];
     }
-    // What a row of L sums to: nothing between two points of cloths.
+    // The sum of a row of L, which is zero for springs between points of cloths.
     if (!is_anchored) continue;
     anchor_vertex_.push_back(points[p]);
     anchor_stiffness_.push_back(k * b[p] * sum);

@@ -16,25 +16,25 @@ namespace diffcloth::elastic {
 ///               + sum_elements D A / 2 (1 + k_d/h) <Y(u) Q, Y(u)>
 ///               + sum_springs  k_a / 2 |sum_p b_p u_p|^2,
 ///
-/// F(u) the gradient of a displacement u and Y(u) its second derivatives. It is the Hessian of the
-/// energy of all cloths less what depends on how triangles turn: no smaller than the Hessian of the
-/// stretch, equal to it in flat bending and springs without a rest length, and no smaller in others. For
-/// damping, for curved rest shapes and for woven cloth whose shear is stiffer than a yarn it is a
-/// positive matrix of the right size, which is all that a solve with it needs.
+/// F(u) the gradient of a displacement u and Y(u) its second derivatives. The form is the Hessian of the
+/// energy of all cloths without the terms from turning triangles: no smaller than the Hessian of the
+/// stretch, equal to the Hessian for flat bending and for springs without a rest length, and no smaller
+/// for other springs. For damping, for curved rest shapes and for woven cloth whose shear is stiffer
+/// than a yarn, it is a positive matrix of the right size, which suffices for a solve.
 ///
-/// The points of springs are those of the cloths alone: bodies stay where they are. Without springs to
-/// targets or bodies L annihilates constants. Entries act on differences of displacements, so that a
-/// force on one vertex is minus that on another to the last bit.
+/// Springs act on their points on cloths alone: bodies do not move. Without springs to targets or
+/// bodies, L annihilates constants. Entries act on differences of displacements, so that the forces on
+/// two vertices are opposite to the last bit.
 class ConstantForm {
  public:
   /// @param model    prepared
-  /// @param pattern  that of the slots; outlives the form
+  /// @param pattern  pattern of the slots; outlives the form
   ConstantForm(const Model& model,
                const Slots& slots,
                std::span<const Springs> springs,
                const linalg::BlockPattern& pattern);
 
-  /// The form of flat bending alone, which is its energy; the values stay the model's.
+  /// The form of flat bending alone, which is its energy; the model keeps the values.
   static ConstantForm of_flat_bending(const Model& model, const linalg::BlockPattern& pattern);
 
   /// The form of all bending without damping, as if every element were flat.
@@ -67,13 +67,13 @@ class ConstantForm {
   std::span<const double> values_;
   void add_spring(const Springs& springs, Index a);
 
-  std::vector<Index> anchor_vertex_;      ///< what is held against the ground
+  std::vector<Index> anchor_vertex_;      ///< vertices with springs to fixed points
   std::vector<double> anchor_stiffness_;  ///< likewise
 };
 
 /// bar += d/d theta (z . L u) for each theta of the model, springs not included.
 ///
-/// @param with_rest  whether the cotangents of the rest shape are wanted
+/// @param with_rest  true to compute the cotangents of the rest shape
 void add_constant_form_mixed(
     const Model& model, const double* u, const double* z, bool with_rest, Bar& bar);
 

@@ -11,9 +11,9 @@ namespace diffcloth::elastic::damping {
 ///
 ///   H_pq = weight / 2 [ (g_p^T (C - C_n) g_q) I + (F g_q)(F g_p)^T + (g_p.g_q) F F^T ],
 ///
-/// which no rigid motion feels. F_n is F at the start of the step. Energies, gradients and Hessians of many
-/// triangles are in stretch_lanes.h. (The damping of bending is the bending energy about the curvature at
-/// the start of the step: see bending.h.)
+/// which is invariant under rigid motion. F_n is F at the start of the step. Energies, gradients and
+/// Hessians of many triangles are in stretch_lanes.h. (The damping of bending is the bending energy
+/// about the curvature at the start of the step: see bending.h.)
 
 /// C - C_n without the cancellation of the identity.
 inline Mat2 strain(const Mat32& F, const Mat32& F_n) {

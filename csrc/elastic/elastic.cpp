@@ -66,7 +66,8 @@ void prepare_form(const Model& model, Index e, Prepared& prepared) {
   }
 }
 
-/// What damping takes from the start of the step. The rest of `prepared` is that of the model.
+/// Compute the quantities that damping derives from the start of the step; the rest of `prepared` is
+/// complete.
 void prepare_start(const Model& model, Prepared& prepared) {
   put_start_gradients(model, prepared.damped, prepared.damping_of_stretch);
   for (Index e = 0; e < model.stencils->size(); ++e) {
@@ -98,11 +99,11 @@ const BendingKernels& bending_here() {
   return best;
 }
 
-/// Where bending is stiffer than this many times inertia, forces by the matrix have torques of its
-/// rounding that turn cloth: each element by itself has none.
+/// Ratio of bending stiffness to inertia above which elements are evaluated individually: the forces of
+/// the matrix have torques at the level of its rounding, which would turn the cloth.
 constexpr double kStiffest = 1e8;
 
-/// Visit the elements that are flat and not of the matrix.
+/// Visit the flat elements that the matrix does not include.
 template <class Visit>
 void for_stiff_elements(const Model& model, Visit&& visit) {
   if (model.prepared->by_matrix) return;
@@ -213,7 +214,7 @@ void prepare(Model& model, const Slots& slots) {
 }
 
 void PreparedCache::prepare(Model& model, const Slots& slots) {
-  // Damping takes numbers from the start of the step.
+  // Damping depends on the start of the step.
   const bool damped = std::ranges::any_of(model.damping, [](double value) { return value != 0.0; });
   const double h = damped ? model.h : 0.0;
   std::vector<double> start;

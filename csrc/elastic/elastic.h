@@ -20,13 +20,13 @@ namespace diffcloth::elastic {
 
 /// Slots of the blocks of every element in a BlockPattern.
 struct Slots {
-  Index block_count = 0;             ///< of the pattern
+  Index block_count = 0;             ///< number of blocks in the pattern
   std::vector<Index> stretch;        ///< [F, 6] lower-triangle pairs of a face
   std::vector<Index> bending_start;  ///< [B + 1] into `bending`
   std::vector<Index> bending;        ///< lower-triangle pairs of each bending element
 };
 
-/// Vertices that an element couples, for every element: what the pattern of the Hessian is made of.
+/// Vertices coupled by each element: they determine the pattern of the Hessian.
 std::vector<std::vector<Index>> cliques(const mesh::Topology& topology,
                                         const mesh::BendingStencils& stencils);
 
@@ -40,14 +40,14 @@ struct Elements {
   std::vector<Index> bending;
 };
 
-/// Those with a marked corner.
+/// Elements with a marked corner.
 ///
-/// @param marked  [points], of which the first are the topology's vertices
+/// @param marked  [points], beginning with the topology's vertices
 Elements elements_at(const mesh::Topology& topology,
                      const mesh::BendingStencils& stencils,
                      const std::vector<char>& marked);
 
-/// What prepare() derives from a Model: constant during one step.
+/// Results of prepare() for a Model: constant during one step.
 struct Prepared {
   std::vector<double> bending;        ///< [B] weight of an element, see bending.h
   std::vector<Mat3> form;             ///< [B]
@@ -55,14 +55,14 @@ struct Prepared {
   std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
   std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, zero if not damped
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
-  std::vector<double> identity;       ///< [slots] the same of what all elements' have of I
-  std::vector<StretchBatch> stretch;  ///< of isotropic faces
-  std::vector<WovenBatch> woven;      ///< of all others
-  std::vector<DampingBatch> damping_of_stretch;  ///< of faces that have any
-  std::vector<Index> damped;                     ///< these faces, ascending
+  std::vector<double> identity;       ///< [slots] sum of all elements' multiples of I
+  std::vector<StretchBatch> stretch;  ///< batches of isotropic faces
+  std::vector<WovenBatch> woven;      ///< batches of all other faces
+  std::vector<DampingBatch> damping_of_stretch;  ///< batches of damped faces
+  std::vector<Index> damped;                     ///< damped faces, ascending
   BendingBatches bent;                           ///< elements that are not flat
-  bool has_damping = false;                      ///< some face has any
-  bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
+  bool has_damping = false;                      ///< true if some face is damped
+  bool by_matrix = true;  ///< energy and gradient of flat elements are computed by their matrix
 };
 
 /// The elastic energy of all cloths and its damping over one step.
@@ -70,11 +70,11 @@ struct Model {
   const mesh::Topology* topology = nullptr;
   const mesh::BendingStencils* stencils = nullptr;
   const mesh::RestShape* rest = nullptr;
-  std::vector<double> stretch;  ///< [F] k_s [N/m]; of the warp where there is a weft
+  std::vector<double> stretch;  ///< [F] k_s [N/m]; of the warp in woven faces
   std::vector<double> bending;  ///< [F] D [N m]; likewise
   std::vector<double> poisson;  ///< [F] nu [-]
   std::vector<double> damping;  ///< [F] k_d [s]
-  // [F] each, or all of one kind empty: every face is isotropic.
+  // [F] each; all four kinds empty: every face is isotropic.
   std::vector<double> stretch_weft;         ///< k_f [N/m]
   std::vector<double> stretch_shear;        ///< k_wf [N/m]
   std::vector<double> bending_weft;         ///< D_f [N m]
@@ -83,17 +83,18 @@ struct Model {
   double h = 0.0;                           ///< time step [s]; only damping needs it
   const double* x_n = nullptr;              ///< [N, 3] start of the step [m]; only damping needs it
   double least_inertia = 0.0;               ///< smallest M / h^2 of a vertex [N/m]
-  const Elements* held = nullptr;  ///< those with a prescribed corner; only backward needs them
-  std::shared_ptr<const Prepared> prepared;  ///< of prepare()
+  const Elements* held = nullptr;  ///< elements with a prescribed corner; only for backward
+  std::shared_ptr<const Prepared> prepared;  ///< result of prepare()
 };
 
-/// Make model.prepared. To be called whenever anything in the model has changed.
+/// Compute model.prepared. Must be called after every change of the model.
 ///
-/// @throws std::invalid_argument where damping has no start of the step or no time step
+/// @throws std::invalid_argument if damping has no start of the step or no time step
 void prepare(Model& model, const Slots& slots);
 
-/// prepare() for models of one rest shape, which often have the numbers of an earlier one: a step's backward those
-/// of the step, a step those of the step before, but for what damping takes from the start of the step.
+/// prepare() for models of one rest shape, whose numbers often equal those of an earlier model: the
+/// backward of a step uses the numbers of the step, a step the numbers of the previous one, except for
+/// the dependence of damping on the start of the step.
 class PreparedCache {
  public:
   PreparedCache() = default;
@@ -103,14 +104,14 @@ class PreparedCache {
   void prepare(Model& model, const Slots& slots);
 
  private:
-  static constexpr std::size_t kFields = 8;  ///< of a model, that there are numbers in
+  static constexpr std::size_t kFields = 8;  ///< fields of a model with one number per face
   static constexpr std::size_t kCapacity = std::size_t{8} << 20;  ///< [bytes]
 
   struct Entry {
     std::array<std::vector<double>, kFields> fields;
     double least_inertia;
-    double h;                   ///< of a model with damping, otherwise zero
-    std::vector<double> start;  ///< x_n, likewise, otherwise empty
+    double h;                   ///< time step of a model with damping, else zero
+    std::vector<double> start;  ///< x_n of a model with damping, else empty
     std::shared_ptr<const Prepared> prepared;
     std::size_t bytes;
   };
@@ -126,13 +127,13 @@ double stretch_energy(const Model& model, const double* x);
 /// Energy of bending, without damping [J].
 double bending_energy(const Model& model, const double* x);
 
-/// Both [J].
+/// Sum of both [J].
 inline double energy(const Model& model, const double* x) {
   return stretch_energy(model, x) + bending_energy(model, x);
 }
 
-// What follows leaves out the flat elements of bending where `prepared.by_matrix`: their energy is
-// quadratic, that of their matrix. See ConstantForm::of_flat_bending().
+// The functions below leave out the flat elements of bending if `prepared.by_matrix`: the energy of
+// these elements is the quadratic form of their matrix. See ConstantForm::of_flat_bending().
 
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].
@@ -145,7 +146,7 @@ void add_gradient(const Model& model, const double* x, double* g);
 
 /// blocks += the Hessian at x, damping and flat elements included [N/m].
 ///
-/// @param place  [slots] where each slot lies in blocks, 9 doubles a place
+/// @param place  [slots] index of each slot in blocks, 9 doubles each
 void add_hessian(const Model& model,
                  const Slots& slots,
                  const double* x,
@@ -153,11 +154,11 @@ void add_hessian(const Model& model,
                  const std::vector<Index>& place,
                  double* blocks);
 
-/// Second stress of each face after a straight motion from x, in the linear model of that motion; what
-/// damping adds to stresses is left out.
+/// Second stress of each face after a straight motion from x, in the linear model of that motion,
+/// without the contribution of damping.
 std::vector<Mat2> extrapolated_stresses(const Model& model, const double* x, const double* to);
 
-/// blocks += the Hessian at x with these second stresses less that with the actual ones.
+/// blocks += the Hessian at x with these second stresses minus the Hessian with the actual ones.
 void add_extrapolation(const Model& model,
                        const Slots& slots,
                        const double* x,
@@ -169,11 +170,11 @@ void add_extrapolation(const Model& model,
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);
 
-/// The same of some elements alone.
+/// Likewise, for some elements alone.
 void add_hessian_product(
     const Model& model, const Elements& elements, const double* x, const double* z, double* y);
 
-/// Cotangents of what a Model depends on.
+/// Cotangents of the inputs of a Model.
 struct Bar {
   std::vector<double> stretch, bending, poisson, damping;                        ///< [F]
   std::vector<double> stretch_weft, stretch_shear, bending_weft, bending_twill;  ///< [F]
@@ -187,13 +188,13 @@ struct Bar {
 
 /// bar += d/d theta (z . grad_x E(x; theta)) for each theta of the model, damping included.
 ///
-/// The cotangents of damping and of x_n are left out where model.x_n is null; k_d has one also
-/// where it is zero.
+/// The cotangents of damping and of x_n are left out if model.x_n is null; k_d has a cotangent also if
+/// it is zero.
 ///
-/// @param with_rest  whether the cotangents of the rest shape are wanted
+/// @param with_rest  true to compute the cotangents of the rest shape
 void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);
 
-/// What of a model has tangents that are not zero.
+/// Groups of a model's inputs with nonzero tangents.
 struct Changing {
   bool materials = false;
   bool rest = false;
@@ -203,18 +204,18 @@ struct Changing {
 /// y += d/d theta (grad_x E(x; theta)) theta_dot over all vertices, damping included: add_mixed(),
 /// transposed.
 ///
-/// @param dot  tangents of what a Bar has cotangents of; where `changing` says so
+/// @param dot  tangents, in the layout of the cotangents; read for the groups in `changing`
 void add_tangent(
     const Model& model, const double* x, const Bar& dot, const Changing& changing, double* y);
 
-/// A number for each of the energies.
+/// A number for each part of the energy.
 struct Energies {
   double stretch;
   double bending;
 };
 
 /// bar += d/d theta of  seed.stretch stretch_energy() + seed.bending bending_energy()  for each theta of
-/// the model, and x_bar += d/dx of it [N, 3]: all elements, no damping.
+/// the model, and x_bar += its derivative by x [N, 3]: all elements, no damping.
 void add_energy_bars(const Model& model,
                      const double* x,
                      const Energies& seed,

@@ -7,7 +7,7 @@
 #include "elastic/stretch.h"
 #include "elastic/woven_derivatives.h"
 
-// What z . grad E, grad E and E of a model depend on besides x: cotangents and tangents.
+// Cotangents and tangents of z . grad E, grad E and E of a model by all inputs except x.
 
 namespace diffcloth::elastic {
 namespace {
@@ -55,7 +55,7 @@ void add_face_damping_mixed(
   }
 }
 
-/// Where the cotangents of the geometry of a bending element are added.
+/// Destinations of the cotangents of the geometry of a bending element.
 bending::GeometryBars geometry_bars(const Model& model, Index e, bool with_rest, Bar& bar) {
   bending::GeometryBars geometry;
   geometry.x_n = bar.x_n.data();

@@ -50,7 +50,7 @@ void ElasticNearness::add_hessian_product(const double* /*x*/, const double* z, 
   form_.add_product(z, y);
 }
 
-// grad P = L (x - y): y gets L z, and what L is made of -z . dL (x - y).
+// grad P = L (x - y): y gets L z, and the parameters of L get  -z . dL (x - y).
 void ElasticNearness::accumulate(const double* x, const double* z) {
   form_.add_product(z, target_bar.data());
   const std::vector<double> u = offset(x);

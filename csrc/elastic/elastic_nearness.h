@@ -9,11 +9,12 @@ namespace diffcloth::elastic {
 
 /// Nearness to a target in the constant form of the elastic energy,  P = 1/2 (x - y)^T L (x - y).
 ///
-/// With nearness in the masses it is that in G = M + h^2 L: see step/schemes/split.cpp. What L is made of is
-/// what the elastic potentials are made of: they keep the cotangents for both.
+/// Together with nearness in the masses, it is the nearness in G = M + h^2 L: see
+/// step/schemes/split.cpp. L has the parameters of the elastic potentials, which keep the cotangents for
+/// both.
 class ElasticNearness final : public Potential {
  public:
-  /// @param elasticity  of the cloths; outlives this potential, like the springs
+  /// @param elasticity  of the cloths; outlives this potential, as do the springs
   /// @param target      y [3 N]
   ElasticNearness(ConstantForm form,
                   ElasticPotential& elasticity,
@@ -30,7 +31,7 @@ class ElasticNearness final : public Potential {
   void swap_cotangents(CotangentStore& store) override { store.exchange(target_bar); }
 
   std::vector<double> target_bar;  ///< [3 N], zero until accumulate()
-  std::vector<double> target_dot;  ///< [3 N] tangent, for add_tangent(); others are the potentials'
+  std::vector<double> target_dot;  ///< [3 N] tangent, for add_tangent(); others: the potentials
 
  private:
   /// u = x - y [3 N].

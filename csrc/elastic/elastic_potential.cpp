@@ -90,7 +90,7 @@ SpringPotential::SpringPotential(Springs springs, Index first_body, Index target
       first_body_(first_body) {}
 
 void SpringPotential::add_couplings(std::vector<std::pair<Index, Index>>& pairs) const {
-  // The base pattern has those between vertices of cloths.
+  // Couplings between vertices of cloths are in the base pattern.
   for (Index a = 0; a < springs_.size(); ++a) {
     for (const Index i : springs_.points(a)) {
       if (i < first_body_) continue;
@@ -131,7 +131,7 @@ void SpringPotential::add_left_out_products(const double* x,
 }
 
 void SpringPotential::accumulate(const double* x, const double* z) {
-  // Few points have a spring: turn the sign of what is added instead.
+  // Few points have a spring: change the sign of the contributions instead.
   std::vector<double> stiffness(stiffness_bar.size(), 0.0);
   std::vector<double> target(target_bar.size(), 0.0);
   add_mixed(springs_, x, z, stiffness.data(), target.data());

@@ -11,7 +11,8 @@
 
 namespace diffcloth::elastic {
 
-/// Which cotangents of an elastic model someone asks for; those of x_n, through damping, always count.
+/// Requested cotangents of an elastic model; the cotangents of x_n, through damping, are always
+/// computed.
 enum class Wanted : std::uint8_t { kNone, kMaterials, kMaterialsAndRest };
 
 /// Stretch, bending and damping of all cloths as a potential. See elastic.h.
@@ -20,13 +21,13 @@ class ElasticPotential final : public Potential {
   /// @param model    prepared; outlives the potential
   /// @param slots    of its elements in the base pattern
   /// @param pattern  the base pattern
-  /// @param wanted   what accumulate() keeps
+  /// @param wanted   cotangents that accumulate() keeps
   ElasticPotential(const Model& model,
                    const Slots& slots,
                    const linalg::BlockPattern& pattern,
                    Wanted wanted);
 
-  /// Take the numbers of the model anew, which has been prepared again.
+  /// Update the potential after the model was prepared again.
   void renew();
 
   double energy(const double* x) const override { return elastic::energy(model_, x); }
@@ -54,10 +55,10 @@ class ElasticPotential final : public Potential {
   const Slots& slots() const { return slots_; }
   Wanted wanted() const { return wanted_; }
 
-  /// Zero until something is accumulated.
+  /// Zero until the first accumulate().
   Bar& bar();
 
-  /// The same for the model's ConstantForm.
+  /// add_tangent() for the model's ConstantForm.
   void add_constant_form_tangent(const double* u, double* y) const {
     elastic::add_constant_form_tangent(model_, u, dot_, changing_, y);
   }
@@ -80,13 +81,13 @@ class ElasticPotential final : public Potential {
   ConstantForm flat_bending_;
   mutable std::vector<double> change_;  ///< scratch
 
-  /// The point where the energy or the gradient was last evaluated: mostly the next iterate.
+  /// Last point at which energy and gradient were evaluated: often the next iterate.
   struct Trial {
-    std::vector<double> x;  ///< of the vertices; empty where nothing is known
+    std::vector<double> x;  ///< positions of the vertices; empty if nothing is known
     std::vector<double> gradient;
   };
   mutable Trial trial_;
-  Bar bar_;                         ///< empty where it is zero
+  Bar bar_;                         ///< empty if zero
   std::vector<Mat2> extrapolated_;  ///< [F] second stresses
   Bar dot_;
   Changing changing_;
@@ -96,7 +97,7 @@ class ElasticPotential final : public Potential {
 class SpringPotential final : public Potential {
  public:
   /// @param springs       views of arrays that outlive the potential
-  /// @param first_body    the first point that is no vertex of a cloth
+  /// @param first_body    the first point that is not a vertex of a cloth
   /// @param target_count  rows of targets
   SpringPotential(Springs springs, Index first_body, Index target_count);
 
@@ -126,7 +127,7 @@ class SpringPotential final : public Potential {
 
   const Springs& springs() const { return springs_; }
 
-  std::vector<double> stiffness_bar;  ///< [A], of what the weight is in
+  std::vector<double> stiffness_bar;  ///< [A], cotangents of the weighted stiffnesses
   std::vector<double> target_bar;     ///< [rows of targets, 3]
   std::vector<double> stiffness_dot;  ///< tangents, for add_tangent()
   std::vector<double> target_dot;

@@ -11,7 +11,7 @@
 
 namespace diffcloth::elastic {
 
-// The elements of a Model: what its parameters and its rest shape make of each.
+// The elements of a Model, from its parameters and its rest shape.
 
 inline Index face_count(const Model& model) {
   return static_cast<Index>(model.topology->faces.size());
@@ -23,7 +23,7 @@ inline Mat32 face_gradient(const Model& model, Index f, const double* x) {
                               row(x, face[2]));
 }
 
-/// The same with other shape gradients.
+/// The gradient with other shape gradients.
 inline Mat32 face_gradient(const Model& model,
                            Index f,
                            const mesh::ShapeGradient& g,
@@ -47,7 +47,7 @@ inline double stretch_weight(const Model& model, Index f) {
   return model.stretch[f] * model.rest->area[f];
 }
 
-/// Whether stretch has derivatives by three stiffnesses. Their values may be equal: see
+/// True if stretch has derivatives by three stiffnesses. Their values may be equal: see
 /// is_orthotropic().
 inline bool is_woven(const Model& model) { return !model.stretch_weft.empty(); }
 
@@ -58,7 +58,7 @@ inline Weave weave(const Model& model, Index f) {
           .axis = (*model.axes)[f]};
 }
 
-/// Whether a face stretches differently in some directions. Others go by one number, k_s.
+/// True if the stretch of a face depends on its direction. Other faces have one stiffness, k_s.
 inline bool is_orthotropic(const Model& model, Index f) {
   return is_woven(model) &&
          (model.stretch_weft[f] != model.stretch[f] || model.stretch_shear[f] != model.stretch[f]);
@@ -81,12 +81,13 @@ inline void add_to_faces(const Model& model, Index e, double bar, std::vector<do
   }
 }
 
-/// Whether bending has derivatives by three stiffnesses: patches alone, as a hinge bends one way.
+/// True if bending has derivatives by three stiffnesses: for patches alone, as a hinge bends in one
+/// direction.
 inline bool is_plate(const Model& model, Index e) {
   return !model.bending_weft.empty() && model.stencils->model[e] == mesh::BendingModel::kPatch;
 }
 
-/// Of a patch, whose numbers are those of its base face.
+/// Plate of a patch, with the parameters of its base face.
 inline Plate plate(const Model& model, Index e) {
   const Index f = model.stencils->faces[e][0];
   return {.warp = model.bending[f],

@@ -8,8 +8,8 @@
 
 namespace diffcloth::elastic {
 
-// What a straight motion makes of the second stress T of a triangle, dE/dF = F T, for any energy of
-// its stretch.
+// Extrapolation of the second stress T of a triangle, dE/dF = F T, along a straight motion, for any
+// energy of its stretch.
 
 /// Second stress after a change G of F, in the linear model of that change.
 ///
@@ -17,8 +17,8 @@ namespace diffcloth::elastic {
 /// @param dP  change of dE/dF along G
 Mat2 extrapolated_stress(const Mat32& F, const Mat32& G, const Mat2& T, const Mat32& dP);
 
-/// The change of the Hessian's blocks where its second stress is `extrapolated` instead of T, in the
-/// order of stretch_lanes.h:
+/// The change of the Hessian's blocks if its second stress is `extrapolated` instead of T, in the order
+/// of stretch_lanes.h:
 ///
 ///   (g_p^T dT g_q) I,
 ///

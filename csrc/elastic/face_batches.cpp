@@ -19,13 +19,13 @@ class FaceLanes {
 
   std::size_t size() const { return (faces_.size() + kStretchLanes - 1) / kStretchLanes; }
 
-  /// The face in a lane; those behind the last one repeat it.
+  /// The face in a lane; unused lanes repeat the last face.
   Index face(std::size_t batch, int lane) const {
     const std::size_t at = kStretchLanes * batch + static_cast<std::size_t>(lane);
     return faces_[std::min(at, faces_.size() - 1)];
   }
 
-  /// @param axes  (f) -> those of the shape gradients, as columns
+  /// @param axes  (f) -> axes of the shape gradients, as columns
   template <class Axes>
   FaceBatch batch(std::size_t b, Axes&& axes) const {
     FaceBatch batch;
@@ -60,7 +60,7 @@ class FaceLanes {
   const std::vector<Index>& faces_;
 };
 
-/// @param weave  (f) -> that of a face, times its area
+/// @param weave  (f) -> weave of a face, times its area
 template <class WeaveOf>
 std::vector<WovenBatch> batches_of(const FaceLanes& faces, WeaveOf&& weave) {
   std::vector<WovenBatch> batches;

@@ -20,12 +20,12 @@ std::vector<WovenBatch> woven_batches(const Model& model,
                                       const Slots& slots,
                                       const std::vector<Index>& faces);
 
-/// The gradients at the start of the step are put by put_start_gradients().
+/// The gradients at the start of the step are set by put_start_gradients().
 std::vector<DampingBatch> damping_batches(const Model& model,
                                           const Slots& slots,
                                           const std::vector<Index>& faces);
 
-/// @param faces  those of the batches
+/// @param faces  faces of the batches
 void put_start_gradients(const Model& model,
                          const std::vector<Index>& faces,
                          std::vector<DampingBatch>& batches);

@@ -35,7 +35,7 @@ DIFFCLOTH_INLINE void gather_sides(const FaceBatch& batch, const double* x, Side
   }
 }
 
-/// The same of x1 - x0, whose differences are taken first.
+/// The sides of x1 - x0, from differences of positions.
 DIFFCLOTH_INLINE void gather_change(const FaceBatch& batch,
                                     const double* x0,
                                     const double* x1,
@@ -75,7 +75,7 @@ DIFFCLOTH_INLINE Gradient gradient(const FaceBatch& batch, const Sides& sides, i
   return F;
 }
 
-/// Add forces on corners 1 and 2, and what balances them on corner 0.
+/// Add forces on corners 1 and 2, and their reaction on corner 0.
 DIFFCLOTH_INLINE void scatter_forces(const FaceBatch& batch,
                                      const double (&force)[6][kLanes],
                                      double* g) {
@@ -101,7 +101,7 @@ DIFFCLOTH_INLINE void scatter_blocks(const FaceBatch& batch,
 /// blocks += the Hessians of batches, exact or projected.
 ///
 /// @param faces  (batch) -> its triangles
-/// @param exact  (batch, x, h) puts the blocks of a batch; `projected` likewise
+/// @param exact  (batch, x, h) writes the blocks of a batch; `projected` likewise
 template <class Batch, class Faces, class Exact, class Projected>
 DIFFCLOTH_INLINE void add_hessians(const Batch* batches,
                                    std::size_t count,

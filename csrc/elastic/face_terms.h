@@ -7,7 +7,7 @@
 namespace diffcloth::elastic {
 
 // Stretch and damping of one face of a model, isotropic or orthotropic, by its deformation gradient F;
-// F_n is that at the start of the step. See stretch.h, damping.h and orthotropic_*.h.
+// F_n is the gradient at the start of the step. See stretch.h, damping.h and orthotropic_*.h.
 
 double stretch_energy(const Model& model, Index f, const Mat32& F);
 
@@ -17,10 +17,11 @@ Mat2 second_stress(const Model& model, Index f, const Mat32& F);
 /// Change of dE/dF along a change G of F.
 Mat32 stretch_stress_change(const Model& model, Index f, const Mat32& F, const Mat32& G);
 
-/// The stiffnesses of a face, times its area; an isotropic one has three equal ones, along its rest frame.
+/// The stiffnesses of a face, times its area; an isotropic face has three equal ones, along its rest
+/// frame.
 Weave stretch_weave(const Model& model, Index f);
 
-/// The same of its damping.
+/// Likewise for its damping.
 Weave damping_weave(const Model& model, Index f);
 
 Mat32 damping_stress_change(

@@ -8,13 +8,13 @@
 
 namespace diffcloth::elastic {
 
-/// D of an element whose form has none; 1 where it has.
+/// D of an element with a form that does not contain D; else 1.
 inline double element_stiffness(const Model& model, Index e) {
   return is_plate(model, e) ? 1.0 : element_mean(model, e, model.bending);
 }
 
-/// A bending element whose form consists of the numbers that it has derivatives by, also where these
-/// are equal and its energy is written with one: D_w, D_f, D_t and nu of a plate, else nu.
+/// A bending element with a form of all parameters that have derivatives, even if their values are equal
+/// and its energy uses a single one: D_w, D_f, D_t and nu of a plate, else nu.
 inline bending::Element differentiable_element(const Model& model, Index e) {
   bending::Element element = bending_element(model, e);
   if (is_plate(model, e)) {
@@ -24,7 +24,7 @@ inline bending::Element differentiable_element(const Model& model, Index e) {
   return element;
 }
 
-/// The numbers that the form of differentiable_element() consists of.
+/// The parameters in the form of differentiable_element().
 class FormNumbers {
  public:
   FormNumbers(const Model& model, Index e)
@@ -38,7 +38,7 @@ class FormNumbers {
 
   bending::FormDerivatives derivatives() const { return {forms_.data(), count_}; }
 
-  /// Change of the form with tangents of the faces' numbers.
+  /// Change of the form with tangents of the faces' parameters.
   Mat3 change(const Bar& dot) const {
     if (count_ == 1) return element_mean(model_, element_, dot.poisson) * forms_[0];
     const Index f = model_.stencils->faces[element_][0];

@@ -22,7 +22,8 @@ inline Mat32 deformation_gradient(const mesh::ShapeGradient& g,
   return (x1 - x0) * g.row(1) + (x2 - x0) * g.row(2);
 }
 
-/// The frame that a triangle carries along, from the polar decomposition F = R S in closed form.
+/// The frame of a triangle, which follows its motion, from the polar decomposition F = R S in closed
+/// form.
 ///
 /// With C = F^T F, d = sqrt(det C) and t = sqrt(tr C + 2 d) = tr S:
 ///
@@ -75,9 +76,9 @@ inline Mat32 rotation_change_adjoint(const Frame& frame,
                                      const Vec3& tau,
                                      const Mat32& K_v,
                                      const Vec3& w_v) {
-  // S changes by the in-plane part of K_v less the rotation of S.
+  // S changes by the in-plane part of K_v minus the rotation of S.
   const double s_scale = frame.S_inv.determinant();
-  Mat2 S;  // inverse of S_inv, so that the two stay consistent where d is floored
+  Mat2 S;  // inverse of S_inv, consistent also if d is floored
   S << frame.S_inv(1, 1), -frame.S_inv(0, 1), -frame.S_inv(1, 0), frame.S_inv(0, 0);
   S /= s_scale;
   Mat2 turned;

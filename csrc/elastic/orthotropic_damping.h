@@ -6,11 +6,12 @@
 
 namespace diffcloth::elastic::orthotropic_damping {
 
-/// Damping of the stretch of one woven triangle over a step, each direction by its own stiffness:
+/// Damping of the stretch of one woven triangle over a step, with one stiffness for each direction:
 ///
 ///   E = k_d A / (8 h) <K o D, D>,   D = C - C_n in material axes,
 ///
-/// which is that of damping.h where the three are equal. All functions take a weave times k_d A / h,
+/// which equals the damping of damping.h if the three are equal. All functions take a weave times k_d A
+/// / h,
 /// and deformation gradients in the rest frame; W(D) = weave.times_in_rest_frame(D).
 
 /// dE/dF = 1/2 F W(C - C_n).

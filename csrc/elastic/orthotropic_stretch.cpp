@@ -8,7 +8,7 @@
 namespace diffcloth::elastic::orthotropic {
 namespace {
 
-/// A yarn of a triangle: y / |y|, which is zero where y is, and |y|.
+/// A yarn of a triangle: y / |y|, or zero for y = 0, and |y|.
 struct Yarn {
   Vec3 direction;
   double length;
@@ -19,7 +19,7 @@ struct Yarn {
   double tension() const { return 1.0 - 1.0 / std::max(length, kDegenerate); }
 };
 
-/// Stiffnesses of the springs along the yarns, beside the isotropic energy.
+/// Stiffnesses of the springs along the yarns, in addition to the isotropic energy.
 Vec2 of_yarns(const Weave& weave) { return {weave.warp - weave.shear, weave.weft - weave.shear}; }
 
 }  // namespace

@@ -11,13 +11,14 @@ namespace diffcloth::elastic::orthotropic {
 ///
 ///   E = A [ k_w / 2 (|w| - 1)^2 + k_f / 2 (|f| - 1)^2 + k_wf (|w| + |f| - t) ].
 ///
-/// The yarns are springs, each along itself. The last term is k_wf times what turns the yarns from r_w and
-/// r_f, |w| (1 - cos) + |f| (1 - cos): it is at least 0, and 0 where the yarns are at right angles, whatever
-/// their lengths. So shear never lengthens a yarn at the price of k_wf alone, and a tension T along a yarn
-/// strains it by T / k and stiffens its shear. To second order in small strain the term is k_wf e_wf^2.
+/// The yarns are springs, each along itself. The last term is k_wf times |w| (1 - cos) + |f| (1 - cos),
+/// with the angles that turn the yarns from r_w and r_f: it is at least 0, and 0 if the yarns are at
+/// right angles, independent of their lengths. So shear never lengthens a yarn at the price of k_wf
+/// alone, and a tension T along a yarn strains it by T / k and stiffens its shear. To second order in
+/// small strain the term is k_wf e_wf^2.
 ///
-/// It is the isotropic energy of stretch.h with k_wf, and springs of the stiffnesses k_w - k_wf and
-/// k_f - k_wf along the yarns, whatever their signs:
+/// It is the isotropic energy of stretch.h with k_wf, plus springs of the stiffnesses k_w - k_wf and k_f
+/// - k_wf, of either sign, along the yarns:
 ///
 ///   dE/dF = A [ k_wf (F - R) + (k_y - k_wf) (1 - 1 / |y|) y ],   y = w in its column, y = f in its own.
 ///

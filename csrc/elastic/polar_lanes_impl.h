@@ -1,4 +1,4 @@
-// The frames of triangles, once for every file with arithmetic in lanes: see stretch_lanes_impl.h.
+// The frames of triangles, shared by all files with arithmetic in lanes: see stretch_lanes_impl.h.
 
 #pragma once
 

@@ -12,10 +12,10 @@ namespace diffcloth::elastic {
 ///
 ///   E(y) = 1/2 sum_a k_a r_a^T P_a r_a,   r_a = sum_p b_p (y_p - x_n,p),
 ///
-/// P = n n^T along the spring at u, or I where its rest length is zero. Targets count as at rest.
+/// P = n n^T along the spring at u, or I if its rest length is zero. Targets are treated as fixed.
 class SpringRate final : public Potential {
  public:
-  /// @param potential  of the springs, whose cotangents and tangents count here, too; outlives this
+  /// @param potential  of the springs, to whose cotangents and tangents this one adds; outlives this
   /// @param middle     u, all points; likewise
   /// @param start      x_n, likewise
   SpringRate(SpringPotential& potential,

@@ -88,7 +88,7 @@ double energy_change(const Springs& springs, const double* x0, const double* x1)
     const Vec3 step = difference(springs, a, x1) - difference(springs, a, x0);
     const Vec3 d0 = extension(springs, a, x0);
     const Vec3 d1 = extension(springs, a, x1);
-    // Of the squares; of the lengths it is that over their sum.
+    // The change of the squares; the change of the lengths is this number over their sum.
     const double squares = step.dot(d0 + d1);
     const double rest = rest_length(springs, a);
     const double lengths = rest == 0.0 ? 0.0 : d0.norm() + d1.norm();

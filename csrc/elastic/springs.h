@@ -6,12 +6,12 @@
 
 namespace diffcloth::elastic {
 
-/// Springs between two points, or between a point and a target that is given:
+/// Springs between two points, or between a point and a given target:
 ///
 ///   E = sum_a k_a / 2 (|d_a| - L_a)^2,    d_a = sum_p b_p x_p - c_a.
 ///
-/// The sum is over the points of spring a. Those of the second end have negative coefficients, and
-/// then there is no c_a. A point of a triangle is a sum over its corners; one of a rigid body is an
+/// The sum is over the points of spring a. Points of the second end have negative coefficients, and
+/// there is then no c_a. A point of a triangle is a sum over its corners; a point of a rigid body is an
 /// affine combination of four of its vertices, which follows every motion of the body exactly. The
 /// coefficients of an end add to one, so that the forces of a spring add to zero, and so do their
 /// moments.
@@ -20,9 +20,9 @@ namespace diffcloth::elastic {
 ///
 ///   grad E = k s d,    grad^2 E = k (n n^T + s (I - n n^T)),
 ///
-/// and along x those times b_p (and b_q). For L = 0, s is one. A spring shorter than L has s < 0 and
-/// pushes; the positive Hessian then has zero in place of s. Where d = 0 and L > 0 no direction is
-/// better than another: the spring has neither force nor Hessian there.
+/// and the derivatives along x are these times b_p (and b_q). For L = 0, s is one. A spring shorter than
+/// L has s < 0 and pushes; the positive Hessian then has zero instead of s. For d = 0 and L > 0 no
+/// direction is distinguished: the spring has neither force nor Hessian.
 ///
 /// Soft pins are springs between one vertex and a target, with L = 0.
 struct Springs {
@@ -35,7 +35,7 @@ struct Springs {
   const double* target;                 ///< [rows, 3] c [m]
 
   Index size() const { return static_cast<Index>(start.size()) - 1; }
-  /// Visit the springs that pull: pickers have one for each vertex, of which all but a few are released.
+  /// Visit the springs with nonzero stiffness: pickers have one for each vertex, most of them released.
   template <class Visit>
   void for_each_pulling(Visit&& visit) const {
     for (Index a = 0; a < size(); ++a) {
@@ -59,10 +59,10 @@ void add_to_points(const Springs& springs, Index a, const Vec3& value, double* y
 /// d of a spring.
 Vec3 extension(const Springs& springs, Index a, const double* x);
 
-/// Whether a spring has a rest length, so that it resists rates along d alone.
+/// True if a spring has a rest length, so that it resists rates along d alone.
 bool has_length(const Springs& springs, Index a);
 
-/// The second derivative of one spring along d; with `positive` the semi-definite one.
+/// The second derivative of one spring along d; if `positive`, its semi-definite part.
 Mat3 hessian(const Springs& springs, Index a, const double* x, bool positive);
 
 double energy(const Springs& springs, const double* x);

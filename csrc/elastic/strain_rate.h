@@ -20,9 +20,10 @@ namespace diffcloth::elastic {
 /// semi-definite, and the stretch in it does not resist rotations about u.
 class StrainRate final : public Potential {
  public:
-  /// @param elastic  of the model, whose cotangents and tangents count here, too; outlives this
+  /// @param elastic  potential of the model, to whose cotangents and tangents this one adds; outlives
+  ///                 this
   /// @param pattern  the base pattern
-  /// @param middle   u, the cloths' vertices at least; outlives this
+  /// @param middle   u, at least for the cloths' vertices; outlives this
   /// @param start    x_n, likewise
   StrainRate(ElasticPotential& elastic,
              const linalg::BlockPattern& pattern,
@@ -46,7 +47,7 @@ class StrainRate final : public Potential {
 
  private:
   std::size_t size() const { return middle_bar.size(); }
-  /// d, with zeros behind up to the rows of the pattern.
+  /// d, padded with zeros to the rows of the pattern.
   std::vector<double> displacement(const double* x) const;
   double product(const std::vector<double>& z, const std::vector<double>& d) const;
   /// S by the slots of the pattern, 9 numbers each.
@@ -57,7 +58,7 @@ class StrainRate final : public Potential {
   const double* middle_;
   const double* start_;
   const linalg::BlockPattern& pattern_;
-  mutable std::vector<double> blocks_;  ///< empty until asked for
+  mutable std::vector<double> blocks_;  ///< empty until first used
 };
 
 }  // namespace diffcloth::elastic

@@ -9,8 +9,8 @@ namespace diffcloth::elastic::stretch {
 ///
 ///   E = k_s A / 2 |F - R|^2 = k_s A / 2 (tr C - 2 t + 2),   R the closest orthonormal columns.
 ///
-/// All functions take the deformation gradient F; forces on corner p are (dE/dF) g_p. What a solve
-/// asks for again and again is in stretch_lanes.h.
+/// All functions take the deformation gradient F; forces on corner p are (dE/dF) g_p. The functions that
+/// a solve calls repeatedly are in stretch_lanes.h.
 
 /// dE/dF = k_s A (F - R).
 inline Mat32 stress(double weight, const Mat32& F) {

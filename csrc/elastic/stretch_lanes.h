@@ -7,18 +7,18 @@
 
 namespace diffcloth::elastic {
 
-// Plain arrays: those of the standard library are templates, see linalg/dense_kernels_impl.h.
+// Plain arrays: standard library arrays are templates, see linalg/dense_kernels_impl.h.
 // NOLINTBEGIN(modernize-avoid-c-arrays)
 
-/// Triangles that go through the arithmetic of stretch side by side.
+/// Number of triangles that are processed side by side.
 inline constexpr int kStretchLanes = 8;
 
-/// Eight triangles, or fewer: the lanes behind the last one repeat it. The corners of each are in
-/// ascending order, so that its blocks are all in a lower triangle.
+/// Up to eight triangles: unused lanes repeat the last one. The corners of each are in ascending order,
+/// so that all its blocks are in a lower triangle.
 struct FaceBatch {
-  std::int32_t size;                      ///< lanes that count
+  std::int32_t size;                      ///< number of used lanes
   std::int32_t vertex[3][kStretchLanes];  ///< ascending
-  std::int32_t slot[6][kStretchLanes];    ///< of the pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
+  std::int32_t slot[6][kStretchLanes];    ///< pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
   double g[4][kStretchLanes];             ///< shape gradients of corners 1 and 2 [1/m]
 };
 
@@ -30,13 +30,13 @@ struct StretchBatch {
 
 /// Woven triangles: see orthotropic_stretch.h.
 struct WovenBatch {
-  FaceBatch faces;                     ///< with shape gradients in material axes
+  FaceBatch faces;                     ///< faces with shape gradients in material axes
   double stiffness[3][kStretchLanes];  ///< k_w, k_wf and k_f, times A [N m]
 };
 
-/// Triangles that are damped, woven or, with three equal stiffnesses, not: see orthotropic_damping.h.
+/// Damped triangles; those that are not woven have three equal stiffnesses: see orthotropic_damping.h.
 struct DampingBatch {
-  WovenBatch woven;  ///< with stiffnesses times k_d / h
+  WovenBatch woven;  ///< weaves with stiffnesses times k_d / h
   double start[6]
               [kStretchLanes];  ///< F at the start of the step in the same axes, column by column
 };
@@ -45,8 +45,8 @@ struct DampingBatch {
 
 /// The stretch of many triangles and its damping in lanes.
 ///
-/// Only sums, products, quotients and roots, each rounded once, in one order: every level has the same
-/// bits.
+/// Arithmetic consists of sums, products, quotients and roots, each rounded once, in one order: all
+/// levels have the same bits.
 struct StretchKernels {
   /// E(x1) - E(x0), summed in the order of the triangles. With both frames orthonormal,
   ///
@@ -71,7 +71,7 @@ struct StretchKernels {
   ///
   /// or its projection, which clamps 1/t to 1/2 and the eigenvalues of S^-1 to 1.
   ///
-  /// @param place  where a slot lies in blocks
+  /// @param place  index of each slot in blocks
   void (*add_hessian)(const StretchBatch* batches,
                       std::size_t count,
                       const double* x,
@@ -79,7 +79,7 @@ struct StretchKernels {
                       const std::int32_t* place,
                       double* blocks);
 
-  // The same three of woven triangles. The energy changes by
+  // Likewise for woven triangles. The energy changes by
   //
   //   dE = k_w (a0 + a1 - 2) / 2 da + k_f (b0 + b1 - 2) / 2 db + k_wf (da + db - dt),   a = |w|, b = |f|,
   //
@@ -95,9 +95,10 @@ struct StretchKernels {
                              const double* x,
                              double* g);
 
-  /// The Hessian is, in the frame of R, the second stress out of plane, and in plane a diagonal less a square, along the
-  /// yarns and across them. The projected one is exact where no yarn is so short that its force alone turns it, so
-  /// wherever the Hessian is positive; elsewhere it is no smaller than the Hessian.
+  /// In the frame of R, the Hessian is the second stress out of plane, and in plane a diagonal along and
+  /// across the yarns minus a rank-one term. The projected Hessian is exact if no yarn is so short that
+  /// its force alone turns it, and therefore wherever the Hessian is positive; elsewhere it is no
+  /// smaller than the Hessian.
   void (*add_woven_hessian)(const WovenBatch* batches,
                             std::size_t count,
                             const double* x,
@@ -105,7 +106,7 @@ struct StretchKernels {
                             const std::int32_t* place,
                             double* blocks);
 
-  // The same three of damping,
+  // Likewise for damping,
   //
   //   H_pq = 1/2 [ (g_p^T W g_q) I + F M_pq F^T ],   M_pq a = K o (a g_q^T + g_q a^T) g_p,   W = K o (C - C_n).
 
@@ -120,7 +121,7 @@ struct StretchKernels {
                                const double* x,
                                double* g);
 
-  /// The projected one keeps the positive part of W.
+  /// The projected Hessian keeps the positive part of W.
   void (*add_damping_hessian)(const DampingBatch* batches,
                               std::size_t count,
                               const double* x,
@@ -129,7 +130,7 @@ struct StretchKernels {
                               double* blocks);
 };
 
-/// @throws std::invalid_argument  where this processor or build has none of that level
+/// @throws std::invalid_argument  if this processor or build has no kernels of that level
 const StretchKernels& stretch_kernels(linalg::KernelLevel level);
 
 }  // namespace diffcloth::elastic

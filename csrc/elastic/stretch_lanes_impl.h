@@ -1,6 +1,6 @@
-// The arithmetic of StretchKernels, written once. Loops over lanes are plain ones, which compilers turn
-// into the instructions that a file is compiled for. Everything here is in an anonymous namespace,
-// for the reason given in linalg/dense_kernels_impl.h.
+// The arithmetic of StretchKernels, in a single implementation. Loops over lanes are plain loops, which
+// compilers turn into the instructions that a file is compiled for. Everything here is in an anonymous
+// namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
 
@@ -18,7 +18,7 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// |F - R|^2, in a form that needs no frame where there is hardly one.
+/// |F - R|^2, in a form that needs no frame for nearly degenerate triangles.
 DIFFCLOTH_INLINE double strain_sq(const Gradient& F, const Polar& p) {
   double regular = 0.0;
   for (int k = 0; k < 3; ++k) {
@@ -109,7 +109,8 @@ DIFFCLOTH_INLINE void project(Polar& p, double& inv_t) {
   const double half = 0.5 * (p.s11 - p.s22);
   const double radius = __builtin_sqrt(half * half + p.s12 * p.s12);
   const double low = mean - radius;
-  // The matrix as it is, the identity, or its larger eigenvalue alone lowered to 1; there radius > 0.
+  // Three cases: the matrix itself; the identity; only the larger eigenvalue lowered to 1, with radius >
+  // 0.
   const bool below = mean + radius <= 1.0;
   const bool above = low >= 1.0;
   const double scale = 0.5 * (1.0 - low) / radius;

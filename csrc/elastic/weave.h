@@ -4,9 +4,9 @@
 
 namespace diffcloth::elastic {
 
-/// Stiffnesses of a woven triangle, and where its yarns lie.
+/// Stiffnesses of a woven triangle, and the directions of its yarns.
 struct Weave {
-  double warp;   ///< k_w [N/m]; times the area where an energy is meant
+  double warp;   ///< k_w [N/m]; times the area for an energy
   double weft;   ///< k_f likewise
   double shear;  ///< k_wf likewise
   Vec2 axis;     ///< unit vector along the warp in the rest frame; the weft is to its left
@@ -25,7 +25,7 @@ struct Weave {
     return result;
   }
 
-  /// The same of a matrix in the rest frame: Q (K o Q^T A Q) Q^T.
+  /// K o A of a matrix in the rest frame: Q (K o Q^T A Q) Q^T.
   Mat2 times_in_rest_frame(const Mat2& A) const {
     const Mat2 Q = axes();
     return Q * times(Q.transpose() * A * Q) * Q.transpose();

@@ -33,7 +33,7 @@ DIFFCLOTH_INLINE Symmetric positive_part(const Symmetric& A) {
   const double radius = __builtin_sqrt(half * half + A.uv * A.uv);
   const bool all = mean - radius >= 0.0;
   const bool none = mean + radius <= 0.0;
-  // Where it is a part the radius is positive.
+  // If only a part is positive, the radius is positive.
   const double larger_one = 0.5 * (mean + radius);
   const double scale = larger_one / radius;
   const double uu = larger_one + scale * half;
@@ -44,7 +44,7 @@ DIFFCLOTH_INLINE Symmetric positive_part(const Symmetric& A) {
           .vv = all ? A.vv : (none ? 0.0 : vv)};
 }
 
-/// A^T B + C^T A: the change of F^T F with A that of F, from C to B.
+/// A^T B + C^T A: the change of F^T F for a change A of F, from C to B.
 DIFFCLOTH_INLINE Symmetric change_of_square(const Gradient& A,
                                             const Gradient& B,
                                             const Gradient& C) {

@@ -65,7 +65,7 @@ void add_woven_tangent(const Model& model,
   const Weave k = weave(model, f);
   const double area = model.rest->area[f];
   const double area_dot = changing.rest ? dot.rest.area[f] : 0.0;
-  Weave force_dot = k.scaled(area_dot);  // of k A
+  Weave force_dot = k.scaled(area_dot);  // change of k A
   if (changing.materials) {
     force_dot.warp += area * dot.stretch[f];
     force_dot.weft += area * dot.stretch_weft[f];

@@ -5,7 +5,7 @@
 
 namespace diffcloth::elastic {
 
-/// Call visit with the weave of each stiffness alone, equal to one, and its cotangent.
+/// Call visit with a unit weave for each of the stiffnesses, and with its cotangent.
 template <class Visit>
 void for_each_stiffness(const Weave& k, Index f, Bar& bar, const Visit& visit) {
   visit(Weave{.warp = 1.0, .weft = 0.0, .shear = 0.0, .axis = k.axis}, bar.stretch[f]);
@@ -13,13 +13,13 @@ void for_each_stiffness(const Weave& k, Index f, Bar& bar, const Visit& visit) {
   visit(Weave{.warp = 0.0, .weft = 0.0, .shear = 1.0, .axis = k.axis}, bar.stretch_shear[f]);
 }
 
-// The parts of add_mixed(), add_tangent() and add_energy_bars() of one face whose stretch has three
-// stiffnesses, also where their values are equal.
+// The parts of add_mixed(), add_tangent() and add_energy_bars() for one face whose stretch has three
+// stiffnesses, even if their values are equal.
 
 void add_woven_mixed(
     const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar);
 
-/// Of damping; the model has a start of the step.
+/// The part of damping; the model has a start of the step.
 void add_woven_damping_mixed(
     const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar);
 

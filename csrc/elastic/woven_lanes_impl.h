@@ -1,5 +1,5 @@
-// The arithmetic of the stretch of woven triangles of StretchKernels: see stretch_lanes_impl.h. Notation
-// and derivation are those of orthotropic_stretch.h.
+// The arithmetic of the stretch of woven triangles for StretchKernels: see stretch_lanes_impl.h.
+// Notation and derivation are in orthotropic_stretch.h.
 
 #pragma once
 
@@ -42,7 +42,7 @@ DIFFCLOTH_INLINE Lengths lengths_of(const Gradient& F) {
   return q;
 }
 
-/// b - a from b^2 - a^2.
+/// b - a from the change b^2 - a^2 of the squares.
 DIFFCLOTH_INLINE double change_of_root(double of_squares, double a, double b) {
   return of_squares / larger(a + b, kShortest);
 }
@@ -116,17 +116,18 @@ void add_woven_gradient(const WovenBatch* batches, std::size_t count, const doub
   }
 }
 
-// In the frame of R, w = (w_1, w_2) |w| and f = (f_1, f_2) |f| with unit vectors. An in-plane change of F moves
-// each yarn along itself, with the stiffness k_y, and across, with
+// In the frame of R, w = (w_1, w_2) |w| and f = (f_1, f_2) |f| with unit vectors. An in-plane change of
+// F moves each yarn along itself, with the stiffness k_y, and across itself, with
 //
 //   m_y = k_wf + (k_y - k_wf) (1 - 1 / |y|),
 //
-// less what turns the frame: the form is
+// minus the part that turns the frame: the form is
 //
 //   diag(k_w, m_w, k_f, m_f) - rho e e^T,   e = (w_2, w_1, -f_1, f_2),   rho = k_wf / t,   |e|^2 = 2.
 //
-// Where the Hessian is positive all m_y are. The projection raises them to zero, and removes the one negative
-// eigenvalue that is left. So it is exact where no m_y is negative, and no smaller than the Hessian anywhere.
+// If the Hessian is positive, all m_y are. The projection raises negative m_y to zero and removes the
+// remaining negative eigenvalue, if any. So it is exact if no m_y is negative, and no smaller than the
+// Hessian anywhere.
 
 /// The frame of each triangle, its form in plane and its second stress.
 struct WovenForms {
@@ -147,7 +148,8 @@ DIFFCLOTH_INLINE void forms_of(const WovenBatch& batch, const double* x, WovenFo
   for (int l = 0; l < kLanes; ++l) {
     const Polar p = polar_of(gradient(batch.faces, sides, l));
     const Stiffness K = stiffness_of(batch, l);
-    // S t has the directions of the yarns in its columns. A yarn without one lies along its own axis.
+    // S t has the directions of the yarns in its columns. A yarn without direction lies along its own
+    // axis.
     const double w1 = larger(p.c11 + p.d, kShortest);
     const double f2 = larger(p.c22 + p.d, kShortest);
     const double inv_w = 1.0 / __builtin_sqrt(w1 * w1 + p.c12 * p.c12);
@@ -192,7 +194,7 @@ struct NegativeParts {
 
 /// Relative step below which the next one of Newton's method is below rounding.
 constexpr double kSmallStep = 1e-8;
-/// Part of rho that counts as zero.
+/// Share of rho that counts as zero.
 constexpr double kNoPart = 1e-16;
 constexpr int kMostSteps = 100;
 
@@ -200,8 +202,9 @@ constexpr int kMostSteps = 100;
 ///
 ///   h(s) = 1 / sum_j e_j^2 / (d_j + s) = rho,
 ///
-/// which rises and is concave, so that Newton's method goes up to the root from a bound below it: h is no larger than
-/// the mean of d_j + s over two. Where h(0) >= rho there is none, and s stays what counts as zero.
+/// which is increasing and concave, so that Newton's method converges monotonically from a lower bound:
+/// h is no larger than half the weighted mean of d_j + s. If h(0) >= rho, there is none, and s stays at
+/// the value that counts as zero.
 DIFFCLOTH_INLINE void negative_parts(const WovenForms& forms, NegativeParts& parts) {
   alignas(64) double e_sq[4][kLanes];
   alignas(64) double s[kLanes];
@@ -216,7 +219,7 @@ DIFFCLOTH_INLINE void negative_parts(const WovenForms& forms, NegativeParts& par
     s[l] = larger(2.0 * forms.rho[l] - mean, kNoPart * forms.rho[l]);
   }
   for (int i = 0; i < kMostSteps; ++i) {
-    alignas(64) double left[kLanes];  // of the step, beside what is small
+    alignas(64) double left[kLanes];  // step minus the smallest significant step
     for (int l = 0; l < kLanes; ++l) {
       double sum = 0.0;
       double slope = 0.0;

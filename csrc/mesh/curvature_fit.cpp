@@ -16,12 +16,12 @@ struct Svd {
   Mat3 V;
 };
 
-/// By rotations of pairs of columns until all are orthogonal [Hestenes 1958]. Eigen's SVD takes five
-/// times as long to compile as the rest of this file.
+/// Rotates pairs of columns until all are orthogonal [Hestenes 1958]. Eigen's SVD takes five times as
+/// long to compile as the rest of this file.
 Svd decompose(const FitMatrix& M) {
   Svd svd{.U = M, .S = Vec3::Zero(), .V = Mat3::Identity()};
   constexpr double kOrthogonal = std::numeric_limits<double>::epsilon();
-  constexpr int kMaxSweeps = 30;  // they converge quadratically: about five are needed
+  constexpr int kMaxSweeps = 30;  // quadratic convergence: about five sweeps are needed
   bool rotated = true;
   for (int sweep = 0; rotated && sweep < kMaxSweeps; ++sweep) {
     rotated = false;
@@ -31,7 +31,7 @@ Svd decompose(const FitMatrix& M) {
       const double c = svd.U.col(p).dot(svd.U.col(q));
       if (std::abs(c) <= kOrthogonal * std::sqrt(a * b)) continue;
       rotated = true;
-      const double cotangent = (b - a) / (2.0 * c);  // of twice the angle
+      const double cotangent = (b - a) / (2.0 * c);  // cotangent of twice the angle
       const double t =
           std::copysign(1.0, cotangent) / (std::abs(cotangent) + std::hypot(1.0, cotangent));
       const Eigen::JacobiRotation<double> turn(1.0 / std::hypot(1.0, t), t / std::hypot(1.0, t));

@@ -11,8 +11,8 @@ namespace diffcloth::mesh {
 
 /// Most points of a quadratic: a triangle and the vertices across its sides.
 inline constexpr int kMaxQuadratic = 6;
-/// Most points that are unfolded together. A side's two triangles and two layers around them have 16;
-/// further layers are only added to five points or fewer, which have ten edges.
+/// Most points that are unfolded together. The two triangles of a side and two layers around them have
+/// 16 points; further layers are only added to five points or fewer, which have ten edges.
 inline constexpr int kMaxPoints = 16;
 
 /// The equation of one extra point in the fit of a patch.
@@ -38,7 +38,7 @@ FitRow<Scalar> fit_row(const std::array<Scalar, 5>& p) {
                 scale * (sqrt2 * (u * v - lambda2 * a * b)), scale * (v * v - lambda2 * b * b)}};
 }
 
-/// Rows of a fit, one a point; at least three (rows of zeros change nothing).
+/// Rows of a fit, one for each point; at least three (rows of zeros change nothing).
 using FitMatrix = Eigen::Matrix<double, Eigen::Dynamic, 3, 0, kMaxPoints, 3>;
 using FitInverse = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxPoints>;
 
@@ -46,10 +46,10 @@ Vec3 singular_values(const FitMatrix& M);
 
 /// Smooth pseudo-inverse: V f(S) U^T of M = U S V^T with f(s) = s^7 / (s^8 + floor^8).
 ///
-/// f is odd and analytic, so the inverse is smooth in M also where the rank changes, and a
-/// direction that the points do not determine (a strip one triangle wide) stays undetermined to
-/// first order. f differs from 1/s by less than 0.7 % where s is twice the floor, and by less than
-/// 2e-4 where it is three times.
+/// f is odd and analytic, so the inverse is smooth in M also where the rank changes, and a direction
+/// that the points do not determine (in a strip one triangle wide) stays undetermined to first order. f
+/// differs from 1/s by less than 0.7 % if s is twice the floor, and by less than 2e-4 if s is three
+/// times the floor.
 FitInverse fit_inverse(const FitMatrix& M, double floor);
 
 /// Cotangent of M from the cotangent of fit_inverse(M).

@@ -8,7 +8,7 @@ namespace {
 using Dual5 = Dual<5>;
 using Dual8 = Dual<8>;
 
-/// Size below which a singular value of a patch counts as zero.
+/// Singular values of a patch below this size count as zero.
 constexpr double kRankFloor = 0.08;
 
 /// The unknown of the fit is (x,uu ; sqrt2 x,uv ; x,vv), whose norm does not depend on the frame.

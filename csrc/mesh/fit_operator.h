@@ -37,10 +37,11 @@ std::array<Scalar, 6> shape_gradient(const Scalar& length, const Scalar& a, cons
   return {-g1u, -(g1v + g2v), g1u, g1v, Scalar(0.0), g2v};
 }
 
-/// Second derivatives of the quadratic of a triangle and the points across its sides; zero without these.
+/// Second derivatives of the quadratic of a triangle and the points across its sides; zero without such
+/// points.
 Operator patch_operator(const Chart& chart);
 
-/// Second derivatives of an element's quadratic: a patch's, or a hinge's in the row uu.
+/// Second derivatives of an element's quadratic: of a patch, or of a hinge in the row uu.
 Operator fit_operator(const BendingStencils& stencils, Index e, const Chart& chart);
 
 /// bar += (d fit_operator / d chart)^T c_bar.
@@ -56,9 +57,9 @@ Operator fit_operator_jvp(const BendingStencils& stencils,
                           const Chart& chart,
                           const ChartBar& dot);
 
-/// How the quadratic of a base triangle leaves through the side opposite a corner: its outward
-/// derivative at the middle of the side is sum_i (k . c_i + [i < 3] g_i) x_i, and N is the side's
-/// share in the second derivatives of the triangle,
+/// Outward derivative of a base triangle's quadratic across the side opposite a corner: at the middle of
+/// the side it is  sum_i (k . c_i + [i < 3] g_i) x_i,  and N is the side's share in the second
+/// derivatives of the triangle,
 ///
 ///   A (x,uu ; x,uv ; x,vv) = boundary integral of n (x) grad x,
 ///   N = |side| / A (n1^2, n1 n2, n2^2).

@@ -14,8 +14,8 @@ namespace diffcloth::mesh {
 struct Chart {
   BaseTriangle<double> base;
   int size = 0;
-  std::array<Vec2, kMaxPoints> u;             ///< of each point
-  std::array<Foot<double>, kMaxPoints> foot;  ///< of each extra point, on its edge
+  std::array<Vec2, kMaxPoints> u;             ///< coordinates of each point
+  std::array<Foot<double>, kMaxPoints> foot;  ///< foot of each extra point on its edge
 
   Mat3 frame() const { return Eigen::Map<const Mat3>(base.frame.data()); }
   double area() const { return 0.5 * base.length * base.b; }

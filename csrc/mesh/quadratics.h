@@ -16,7 +16,7 @@ namespace diffcloth::mesh {
 using OperatorMap = Eigen::Map<Eigen::Matrix<double, 3, Eigen::Dynamic>>;
 using ConstOperatorMap = Eigen::Map<const Eigen::Matrix<double, 3, Eigen::Dynamic>>;
 
-/// The points of a fitted side in the plane of its first element, whose side it is.
+/// The points of a fitted side in the plane of its first element.
 inline SideStencil side_stencil(const Chart& chart, Index corner) {
   SideStencil result{.u = SidePoints(chart.size, 2), .a = (corner + 1) % 3, .b = (corner + 2) % 3};
   for (int i = 0; i < chart.size; ++i) result.u.row(i) = chart.u[i].transpose();
@@ -44,7 +44,7 @@ struct Fits {
   }
 };
 
-/// Place of each point of a chart among the vertices of element e.
+/// Index of each point of a chart among the vertices of element e.
 inline std::vector<Index> places(const BendingStencils& stencils, Index e, Index chart) {
   const std::span<const Index> vertices = stencils.element(e);
   std::vector<Index> result;
@@ -58,10 +58,10 @@ inline std::vector<Index> places(const BendingStencils& stencils, Index e, Index
 struct ElementSide {
   Index side;
   Index element, corner;
-  double sign;  ///< of the side's derivative, outward from the element
+  double sign;  ///< sign of the side's derivative relative to the outward direction
 };
 
-/// Call with each element's part of each fitted side, in order.
+/// Call the function with each element's part of each fitted side, in order.
 template <class Function>
 void for_each_element_side(const BendingStencils& stencils, const Function& function) {
   for (std::size_t s = 0; s < stencils.sides.size(); ++s) {
@@ -87,15 +87,15 @@ inline OperatorMap element_columns(const BendingStencils& stencils,
 //
 //   A (x,uu ; x,uv ; x,vv) = sum_sides |side| (n n^T dx/dn + sym(n t^T) (x_b - x_a) / |side|),
 //
-// in which only the derivative across a side depends on the fit. With the one of the side in the place of
-// the one of the triangle's quadratic,
+// in which only the derivative across a side depends on the fit. If the fitted derivative of the side
+// replaces the derivative of the triangle's quadratic,
 //
 //   c_T <- c_T + sum_sides N (w - d_T),
 //
-// d_T the outward derivative of the quadratic at the middle of the side. Both triangles take the same
+// d_T is the outward derivative of the quadratic at the middle of the side. Both triangles use the same
 // w: the sum of A c over all triangles is a boundary term, a constant curvature leaves no force on an
 // interior vertex, and the mesh cannot relax below the energy of a quadratic by moving single vertices.
-// The quadratic of a triangle all of whose sides are fitted drops out; it is the linear one.
+// If all sides of a triangle are fitted, its quadratic drops out and is linear.
 inline std::vector<double> curvature_operator(const BendingStencils& stencils, const Fits& fits) {
   std::vector<double> result(3 * stencils.vertices.size(), 0.0);
   for (Index e = 0; e < stencils.size(); ++e) {

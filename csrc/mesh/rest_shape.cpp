@@ -64,8 +64,8 @@ void element_side_vjp(const BendingStencils& stencils,
   add_base_bar(dual.g, g_bar, bar.base[e]);
 }
 
-/// Curvature times element size below which a rest shape is flat: rounding of the curvature
-/// itself, and of coordinates far from the origin.
+/// Curvature times element size below which a rest shape is flat: the rounding of the curvature and of
+/// coordinates far from the origin.
 double flat_threshold(const Topology& topology, const double* X, double area) {
   double extent = 0.0;
   for (Index i = 0; i < 3 * topology.vertex_count; ++i) extent = std::max(extent, std::abs(X[i]));
@@ -128,7 +128,7 @@ void chart_vjp(std::span<const Index> vertices,
   base_triangle_vjp({vertices[0], vertices[1], vertices[2]}, X, bar, X_bar);
 }
 
-/// From b = R^T sum_i (X_i - X_0) c_i^T to X, to the frame R and to c.
+/// Pull back b = R^T sum_i (X_i - X_0) c_i^T to X, to the frame R and to c.
 void curvature_vjp(std::span<const Index> vertices,
                    const ConstOperatorMap& c,
                    const double* X,

@@ -13,30 +13,29 @@ namespace diffcloth::mesh {
 /// Shape gradients of a triangle, one corner a row.
 using ShapeGradient = Eigen::Matrix<double, 3, 2>;
 
-/// How a face resists bending.
+/// Discretization of bending at a face.
 ///
-/// A patch has the second derivatives whose mean over its triangle follows from the derivatives across
-/// its sides (see FittedSide). It gives every quadratic map its exact energy on every mesh,
-/// boundaries included, and a bent plate its stiffness.
+/// Patch: the mean second derivatives over its triangle follow from the derivatives across its sides
+/// (see FittedSide). Every quadratic map has its exact energy on every mesh, boundaries included, and a
+/// bent plate its stiffness.
 ///
-/// A hinge is that of Bergou and DiffCloth: three to nine times too stiff, for comparisons.
+/// Hinge: the element of Bergou and DiffCloth, three to nine times too stiff, for comparisons.
 enum class BendingModel : std::uint8_t { kPatch, kHinge };
 
-/// A side whose derivative is fitted by itself (side_derivative.h) and taken by the patches at both
-/// sides. At the other sides the quadratics of both patches have the same derivative, which is taken.
-/// On grids with one diagonal and on equilateral meshes there are no fitted sides away from the boundary.
+/// A side with a fitted derivative (side_derivative.h), used by the patches at both sides. At all other
+/// sides the quadratics of both patches have equal derivatives, which are used. Grids with one diagonal
+/// and equilateral meshes have no fitted sides away from the boundary.
 struct FittedSide {
-  std::array<Index, 2> element;  ///< the second is -1 where there is none
-  std::array<Index, 2> corner;   ///< the side is opposite that corner of the base triangle
+  std::array<Index, 2> element;  ///< the second is -1 if there is none
+  std::array<Index, 2> corner;   ///< corner of the base triangle opposite the side
 };
 
-/// Which vertices each bending element couples.
+/// Vertices that each bending element couples.
 ///
-/// The first three vertices of an element are the corners of its base face; then come the other
-/// points of its quadratic, unless all its sides are fitted, and then the points of the fitted sides. The points of
-/// a quadratic, or of a side, are laid into the plane of a base face by unfolding the mesh.
-/// The choice is made once, from the scene's rest mesh, and then kept, so that everything is smooth
-/// in the rest positions.
+/// The first three vertices of an element are the corners of its base face, followed by the other points
+/// of its quadratic, unless all its sides are fitted, and by the points of the fitted sides. The points
+/// of a quadratic, or of a side, are mapped to the plane of a base face by unfolding the mesh. Stencils
+/// are chosen once, from the scene's rest mesh, so that everything is smooth in the rest positions.
 struct BendingStencils {
   std::vector<Index> start{0};              ///< [B + 1] into `vertices`
   std::vector<Index> vertices;              ///< [start.back()]
@@ -44,9 +43,9 @@ struct BendingStencils {
   std::vector<BendingModel> model;          ///< [B]
   std::vector<FittedSide> sides;            ///< [S]
   std::vector<Index> chart_start{0};        ///< [B + S + 1] into `chart_points`
-  std::vector<Index> chart_points;          ///< of each element's quadratic, then of each side
-  /// [chart_start.back()] Local edge a -> b that an extra point is unfolded about; it lies to the
-  /// right of it. Corners of the base face hold {-1, -1}.
+  std::vector<Index> chart_points;          ///< points of each element, then of each side
+  /// [chart_start.back()] Local edge a -> b about which an extra point is unfolded, to the right of the
+  /// edge. Corners of the base face have {-1, -1}.
   std::vector<std::array<Index, 2>> unfold_edge;
 
   Index size() const { return static_cast<Index>(faces.size()); }
@@ -64,8 +63,8 @@ struct BendingStencils {
   }
 };
 
-/// One patch for each face that asks for it and has a neighbor; one hinge for each interior edge
-/// both of whose faces ask for it.
+/// One patch for each face with this model and a neighbor; one hinge for each interior edge between two
+/// faces with that model.
 ///
 /// @param X           rest positions, [N, 3] [m]
 /// @param face_model  one a face
@@ -73,7 +72,7 @@ BendingStencils choose_stencils(const Topology& topology,
                                 const double* X,
                                 std::span<const BendingModel> face_model);
 
-/// Everything that the potentials need of the rest positions X.
+/// Quantities that the potentials compute from the rest positions X.
 ///
 /// Each face has the orthonormal rest frame r1 = (X1 - X0) / |.|, r2 = n x r1 and coordinates
 /// (u, v) in it.
@@ -89,7 +88,7 @@ struct RestShape {
   std::vector<double> vertex_area;     ///< [N] a third of the adjacent faces [m^2]
   std::vector<double> edge_area;       ///< [E] a third of the adjacent faces [m^2]
   std::vector<double> edge_length_sq;  ///< [E] [m^2]
-  bool curved = false;                 ///< some curvature is above rounding; the rest are exactly 0
+  bool curved = false;                 ///< some curvature exceeds rounding; others are exactly 0
 };
 
 RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, const double* X);

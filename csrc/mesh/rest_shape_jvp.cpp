@@ -1,4 +1,4 @@
-// Forward: the charts, the operators of the quadratics, the derivatives of the fitted sides, the curvature.
+// Forward derivatives: charts, operators of the quadratics, derivatives of the fitted sides, curvature.
 
 #include <array>
 #include <span>

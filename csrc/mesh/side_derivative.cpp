@@ -18,31 +18,31 @@ using Mat2 = Eigen::Matrix2d;
 using Dual1 = Dual<1>;
 using Dual3 = Dual<3>;
 
-/// Singular values of the whitened quadratics, .5 to .7 on regular meshes: the size below which one
-/// counts as zero, and the one from which on it counts as determined.
+/// Bounds on the singular values of the whitened quadratics, which are .5 to .7 on regular meshes:
+/// values below kSideFloor count as zero, values from kDetermined on as determined.
 constexpr double kSideFloor = 0.04;
 constexpr double kDetermined = 0.12;
-/// Largest |w| of a stencil that needs no second layer, see SideQuality.
+/// Largest |w| of a stencil without a second layer, see SideQuality.
 constexpr double kModerate = 3.0;
-/// Weight of |w| beside the error of cubics. Three times as much halves the largest eigenvalue on meshes of
-/// slivers, and triples the error of waves.
+/// Weight of |w| relative to the error of cubics. Three times this weight halves the largest eigenvalue
+/// on meshes of slivers, and triples the error of waves.
 constexpr double kRidge = 1e-2;
-/// Where a direction counts as determined in least_hessian(), relative to the size of G.
+/// Size, relative to G, from which on least_hessian() treats a direction as determined.
 constexpr double kKept = 1e-9;
-/// Weight of an error of quadratics beside one of cubics.
+/// Weight of an error of quadratics relative to an error of cubics.
 constexpr double kQuadraticError = 1e4;
 
 constexpr double kRoot2 = std::numbers::sqrt2;
 constexpr double kRoot12 = 2.0 * std::numbers::sqrt3;
 
-/// Measures of the points by C = sum_i (u_i - mean)(u_i - mean)^T: the coordinates B u have the unit
-/// matrix in its place.
+/// Scales of the points from C = sum_i (u_i - mean)(u_i - mean)^T, which is the unit matrix for the
+/// coordinates B u.
 template <class Scalar>
 struct Metric {
   std::array<Scalar, 4> B;  ///< C^-1/2
   std::array<Scalar, 9>
       G;          ///< |f,uu|^2 + 2 |f,uv|^2 + |f,vv|^2 of (f,yy ; sqrt2 f,yz ; f,zz), y = B u
-  Scalar length;  ///< square root of |C / count|: smooth also where the points are round
+  Scalar length;  ///< square root of |C / count|: smooth also for round sets of points
 };
 
 /// @param C  uu, uv, vv
@@ -87,7 +87,7 @@ SideTarget<Scalar> side_target(const std::array<Scalar, 3>& p) {
                     mixed * (y * y * a + two * x * y * b), pure * y * y * b}};
 }
 
-// Cubics u^a v^b / sqrt(3! a! b!), the sum of whose squares does not depend on the frame.
+// Cubics u^a v^b / sqrt(3! a! b!): the sum of their squares does not depend on the frame.
 
 Vec4 cubics(const Vec2& u) {
   const double x = u.x(), y = u.y();
@@ -114,12 +114,12 @@ SidePoints centered(const SidePoints& x) { return x.rowwise() - x.colwise().mean
 
 Mat3 as_matrix(const std::array<double, 9>& G) { return Eigen::Map<const Mat3>(G.data()); }
 
-/// Replaces the targets of quadratics that the points do not determine: of all that agree on the
-/// points, the one of least Hessian in the plane,
+/// Replaces the targets of quadratics that the points do not determine: among all targets that agree on
+/// the points, selects the target with the least Hessian in the plane,
 ///
 ///   c = c2 - G D (D G D + kept ((1 + kKept) I - D^2))^-1 D^2 c2,   kept = kKept tr G,
 ///
-/// with D the share of each direction that is lost. A strip one triangle wide would be stiff otherwise.
+/// with D the share of each direction that is lost. Otherwise a strip one triangle wide would be stiff.
 struct LeastHessian {
   Mat3 G, D;
   Vec3 c2;
@@ -160,10 +160,10 @@ LeastHessian least_hessian(const Mat3& G, const Mat3& D, const Vec3& c2) {
   return result;
 }
 
-/// Everything on the way from the points to w.
+/// All steps from the points to w.
 ///
-/// With y = B x whitened, P0 the projector onto weights that no affine function sees, and F the smooth
-/// inverse of A = P0 a, a the quadratics of y:
+/// With y = B x whitened, P0 the projector onto weights that annihilate affine functions, and F the
+/// smooth inverse of A = P0 a, a the quadratics of y:
 ///
 ///   w0 = (y - mean) B n     affine functions exactly, the least |w|
 ///   z = w0 + F^T c          quadratics, c their targets after LeastHessian
@@ -173,7 +173,7 @@ LeastHessian least_hessian(const Mat3& G, const Mat3& D, const Vec3& c2) {
 ///   (P Q P + kRidge^2) v = P (K^T t - Q z),   Q = K^T K + kRidge^2.
 struct SideFit {
   int count, a, b;
-  SidePoints x, x_mean_free;  ///< from the middle of the side; from the mean
+  SidePoints x, x_mean_free;  ///< relative to the middle of the side; to the mean
   Vec2 half;
   Metric<double> scales;
   SideTarget<double> target;
@@ -244,7 +244,7 @@ struct SideFit {
 
   FitMatrix quadratics_of_points() const {
     FitMatrix result(count, 3);
-    const double scale = std::sqrt(count);  // singular values then do not depend on the count
+    const double scale = std::sqrt(count);  // makes singular values independent of the count
     for (int i = 0; i < count; ++i) {
       result.row(i) = scale * quadratics(y.row(i).transpose()).transpose();
     }
@@ -262,7 +262,7 @@ struct SideFit {
 
 SideWeights side_derivative(const SideStencil& stencil) { return SideFit(stencil).w; }
 
-// Backwards through SideFit, one line of it after the other.
+// The pull back of SideFit, line by line in reverse.
 SidePoints side_derivative_vjp(const SideStencil& stencil, const SideWeights& w_bar) {
   const SideFit fit(stencil);
   const int count = fit.count;

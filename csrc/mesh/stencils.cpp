@@ -14,11 +14,11 @@
 namespace diffcloth::mesh {
 namespace {
 
-/// Smallest singular value from which on six points determine a quadratic by themselves.
+/// Smallest singular value with which six points determine a quadratic.
 constexpr double kWellPosed = 0.15;
 
-/// Largest weight of the sum of two outward derivatives, relative to the largest in either of them, below
-/// which two quadratics agree across their side.
+/// Two quadratics agree across their side if the largest weight of the sum of their outward derivatives,
+/// relative to the largest weight in either of them, is below this value.
 constexpr double kAgreement = 1e-3;
 
 Index other_face(const Topology& topology, Index edge, Index face) {
@@ -31,7 +31,7 @@ Index corner_opposite(const Topology& topology, Index face, Index edge) {
   return static_cast<Index>(std::ranges::find(edges, edge) - edges.begin());
 }
 
-/// Faces while they are unfolded, one after the other, and their vertices.
+/// Faces unfolded one after the other, and their vertices.
 class Patch {
  public:
   Patch(const Topology& topology, Index face)
@@ -50,7 +50,7 @@ class Patch {
 
   /// Add the faces across all sides.
   ///
-  /// @returns  whether this brought a vertex
+  /// @returns  true if a vertex was added
   bool add_layer() {
     const std::size_t face_count = faces_.size(), vertex_count = vertices_.size();
     for (std::size_t i = 0; i < face_count; ++i) {
@@ -63,7 +63,7 @@ class Patch {
  private:
   struct Unfolded {
     Index face;
-    std::array<Index, 3> corner;  ///< places of its corners, counterclockwise in the plane
+    std::array<Index, 3> corner;  ///< indices of its corners, counterclockwise in the plane
   };
 
   Index place(Index v) const {
@@ -111,7 +111,7 @@ void append_element(const Patch& patch,
   stencils.model.push_back(model);
 }
 
-/// A face that bends as a patch, and the quadratic of its six points if these determine it.
+/// A face that bends as a patch, and the quadratic of its six points if they determine it.
 struct PatchFace {
   Index face;
   Patch patch;
@@ -148,12 +148,12 @@ bool agree(const PatchFace& f0, Index corner0, const PatchFace& f1, Index corner
       largest = std::max(largest, std::abs(w1(static_cast<Index>(j))));
     }
   }
-  // Of both, so that the order of the faces does not matter.
+  // The maximum over both makes the result independent of the order of the faces.
   return largest < kAgreement * std::max(w0.cwiseAbs().maxCoeff(), w1.cwiseAbs().maxCoeff());
 }
 
-/// The two faces of a side, and layers around them: one, or as many as bring six points. A second one where the
-/// points do not determine the derivative well, if they do then.
+/// The two faces of a side, and layers around them: one, or as many as needed for six points. A second
+/// layer is added if the points do not determine the derivative well and the layer improves that.
 Patch side_patch(const Topology& topology, Index face, Index corner, const double* X) {
   Patch first(topology, face);
   first.add_across(corner);
@@ -171,7 +171,7 @@ Patch side_patch(const Topology& topology, Index face, Index corner, const doubl
   return better ? second : first;
 }
 
-/// Each element couples the points of its own quadratic and of its fitted sides.
+/// Collect the vertices of elements: the points of their own quadratic and of their fitted sides.
 void gather_vertices(BendingStencils& stencils) {
   std::vector<std::vector<Index>> elements(stencils.size());
   for (Index e = 0; e < stencils.size(); ++e) {
@@ -190,7 +190,7 @@ void gather_vertices(BendingStencils& stencils) {
   }
 }
 
-/// True if a patch has a single face, which has no side to bend about.
+/// True if a patch has a single face and therefore no side about which to bend.
 bool alone(const Patch& patch) { return patch.vertices().size() == 3; }
 
 /// The patches, and the charts of their fitted sides.

@@ -8,7 +8,7 @@
 namespace diffcloth::mesh {
 namespace {
 
-/// One side of a face, as it is sorted into edges.
+/// One side of a face, to be sorted into edges.
 struct HalfEdge {
   std::array<Index, 2> edge;
   Index face;

@@ -12,7 +12,7 @@ struct Topology {
   Index vertex_count = 0;
   std::vector<std::array<Index, 3>> faces;
   std::vector<std::array<Index, 2>> edges;       ///< unique, v0 < v1, lexicographic
-  std::vector<std::array<Index, 2>> edge_faces;  ///< smaller face first, -1 where missing
+  std::vector<std::array<Index, 2>> edge_faces;  ///< smaller face first, -1 if missing
   std::vector<std::array<Index, 3>> face_edges;  ///< the edge opposite corner p
 
   Topology() = default;

@@ -42,14 +42,14 @@ BaseTriangle<Scalar> base_triangle(const std::array<Scalar, 9>& X) {
           .frame = {r1[0], r1[1], r1[2], r2[0], r2[1], r2[2], n[0], n[1], n[2]}};
 }
 
-/// Where the third corner of a triangle lies relative to its edge a -> b, in edge lengths: `along`
-/// it from a, and `off` to its side.
+/// Position of the third corner of a triangle relative to its edge a -> b, in edge lengths: `along` the
+/// edge from a, and `off` to its side.
 template <class Scalar>
 struct Foot {
   Scalar along, off;
 };
 
-/// @param X  the corners a, b and the third
+/// @param X  the corners a, b and the third corner
 template <class Scalar>
 Foot<Scalar> unfold(const std::array<Scalar, 9>& X) {
   using std::sqrt;

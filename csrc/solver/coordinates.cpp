@@ -9,7 +9,7 @@
 namespace diffcloth::solver {
 namespace {
 
-/// Largest size among some numbers; NaN counts as infinite.
+/// Largest absolute value; NaN counts as infinite.
 double largest(const double* first, const double* last) {
   double result = 0.0;
   for (; first != last; ++first) {
@@ -89,7 +89,7 @@ void Coordinates::follow(const std::vector<double>& x, std::vector<double>& dx) 
   std::vector<double> change(static_cast<std::size_t>(node_offset() - body_offset()), 0.0);
   mechanisms_->push_forward(nodes(x), nodes(dx), change.data());
   for (Index v = cloth_vertex_count_; v < vertex_count_; ++v) {
-    // What is prescribed as a whole has its change already.
+    // Surfaces that are prescribed as a whole have their change already.
     if ((*prescribed_)[v] != 0) continue;
     Eigen::Map<Vec3>(dx.data() + 3 * v) += row(change.data(), v - cloth_vertex_count_);
   }
@@ -151,7 +151,7 @@ void Coordinates::add_curvature(const double* x,
 linalg::Couplings Coordinates::couplings_of_rows(linalg::Couplings points) const {
   if (!is_curved()) {
     std::erase_if(points, [&](const std::pair<Index, Index>& pair) {
-      // The greater one first.
+      // The greater index comes first.
       return pair.first >= cloth_vertex_count_ || !is_free(pair.first) || !is_free(pair.second);
     });
     return points;

@@ -10,19 +10,19 @@
 
 namespace diffcloth::solver {
 
-/// The unknowns z of a solve, and how the points x of a scene depend on them.
+/// The unknowns z of a solve, and the points x of a scene as a function of z.
 ///
 /// A configuration x is a list of points, 3 numbers each:
 ///
 ///   cloth vertices | vertices of bodies and links | nodes of coordinates | nodes of frames
 ///
-/// (see bodies::Mechanisms for the latter two). z are the cloth vertices and the nodes of coordinates:
-/// the rows of the linear system. Pins and what else is prescribed are part of x, and rows at most,
-/// but no unknowns. Vertices that follow free coordinates have no rows: `attachments` says how they
-/// move with those.
+/// (see bodies::Mechanisms for both kinds of nodes). z consists of the cloth vertices and the nodes of
+/// coordinates, which are the rows of the linear system. Pins and other prescribed points are part of x;
+/// they may have rows, but are no unknowns. Vertices that follow free coordinates have no rows:
+/// `attachments` holds the derivative of their positions by the coordinates.
 class Coordinates {
  public:
-  /// @param prescribed  [points]; it and the mechanisms outlive the coordinates
+  /// @param prescribed  [points]; this array and the mechanisms must outlive the coordinates
   Coordinates(Index cloth_vertex_count,
               Index vertex_count,
               const bodies::Mechanisms& mechanisms,
@@ -33,64 +33,64 @@ class Coordinates {
   Index point_count() const { return static_cast<Index>(prescribed_->size()); }
   Index row_count() const { return cloth_vertex_count_ + mechanisms_->node_count(); }
 
-  /// Length of z; entries of pinned vertices are there and stay zero in every change.
+  /// Length of z. Pinned vertices have entries, which stay zero in every change.
   std::size_t size() const { return 3 * static_cast<std::size_t>(row_count()); }
 
   const bodies::Mechanisms& mechanisms() const { return *mechanisms_; }
   const std::vector<char>& prescribed() const { return *prescribed_; }
 
-  /// Whether points do not all move on straight lines.
+  /// True if some points may move on curves: there are free coordinates.
   bool is_curved() const { return mechanisms_->has_free(); }
-  /// The same of one change of all points.
+  /// True if some points move on curves in this change of all points.
   bool is_curved(const std::vector<double>& dx) const;
 
-  /// The point of a row, and whether it is an unknown.
+  /// Point of a row; is_free(): true if that point is an unknown.
   Index point(Index row) const {
     return row < cloth_vertex_count_ ? row : row - cloth_vertex_count_ + vertex_count_;
   }
   bool is_free(Index row) const { return (*prescribed_)[point(row)] == 0; }
 
-  /// The coordinates' nodes, and behind them those of the frames.
+  /// Nodes of the coordinates, followed by the nodes of the frames.
   const double* nodes(const std::vector<double>& x) const { return x.data() + node_offset(); }
   double* nodes(std::vector<double>& x) const { return x.data() + node_offset(); }
 
-  /// Rows of a list of points, as z, and their addition to one.
+  /// Conversions between a list of points and its rows z: extract, add, overwrite and clear rows.
   void take_rows(const std::vector<double>& x, std::vector<double>& z) const;
   void add_rows(const std::vector<double>& z, std::vector<double>& x) const;
   void put_rows(const double* z, std::vector<double>& x) const;
   void clear_rows(std::vector<double>& x) const;
 
-  /// Put the vertices of links where the nodes of x say.
+  /// Compute the vertices of links from the nodes of x.
   void place(std::vector<double>& x) const;
 
-  /// Find the attachments at x.
+  /// Compute the attachments at x.
   void stand_at(const double* x);
   const linalg::Attachments& attachments() const { return attachments_; }
 
-  /// dx = (dx/dz) dz over all points, where the coordinates stand: zero at prescribed ones.
+  /// dx = (dx/dz) dz over all points, at the point of the last stand_at(): zero at prescribed points.
   void push_forward(const std::vector<double>& dz, std::vector<double>& dx) const;
 
-  /// Add to a change of points, given at the nodes, that of the vertices of links.
+  /// Add to dx, a change that is given at the nodes, the resulting change of the vertices of links.
   void follow(const std::vector<double>& x, std::vector<double>& dx) const;
 
-  /// g_z = (dx/dz)^T g, where the coordinates stand: zero at prescribed rows.
+  /// g_z = (dx/dz)^T g, at the point of the last stand_at(): zero at prescribed rows.
   void pull_back(const std::vector<double>& g, std::vector<double>& g_z) const;
 
-  /// Move the cotangents of the vertices of links to all nodes that they depend on.
+  /// Move the cotangents of the vertices of links to all nodes on which they depend.
   void gather(const std::vector<double>& x, std::vector<double>& bar) const;
 
-  /// Let the vertices of links follow a change of all nodes: gather() transposed.
+  /// Compute the change of the vertices of links from a change of all nodes: gather() transposed.
   void carry(const std::vector<double>& x, std::vector<double>& dx) const;
 
-  /// bar -= the derivative of  g . (change of the vertices of links with the coordinates in dx)  by all
-  /// nodes.
+  /// Subtract from bar the derivative by all nodes of  g . (change of the vertices of links with the
+  /// coordinates in dx).
   void subtract_change(const std::vector<double>& x,
                        const std::vector<double>& dx,
                        const std::vector<double>& g,
                        std::vector<double>& bar) const;
 
-  /// g_dot += the change of  (dx/dz)^T g  with dx, a change of prescribed nodes: subtract_change()
-  /// transposed, with the other sign.
+  /// Add to g_dot the change of  (dx/dz)^T g  with dx, a change of prescribed nodes: subtract_change()
+  /// transposed, with the opposite sign.
   void add_change(const std::vector<double>& x,
                   const std::vector<double>& dx,
                   const std::vector<double>& g,
@@ -99,18 +99,18 @@ class Coordinates {
   /// A += the second derivative of  g . x(z)  at x.
   void add_curvature(const double* x, const std::vector<double>& g, linalg::BlockMatrix& A) const;
 
-  /// Couplings of points in terms of rows; those that have none are left out. Not sorted.
+  /// Couplings of points, expressed in rows; points without rows are left out. Not sorted.
   linalg::Couplings couplings_of_rows(linalg::Couplings points) const;
 
-  /// The points at the fraction alpha of a change dx: in one straight line but for what follows free
-  /// coordinates.
+  /// The points at the fraction alpha of a change dx: on straight lines, except for points that follow
+  /// free coordinates.
   void retract(const std::vector<double>& x,
                const std::vector<double>& dx,
                double alpha,
                std::vector<double>& out) const;
 
-  /// Largest fraction of a change from x that turns no link too far for one step, and takes no joint
-  /// to the end of its limits.
+  /// Largest fraction of a change from x that turns no link beyond the bound for one step and moves no
+  /// joint to the end of its limits.
   double largest_fraction(const std::vector<double>& x, const std::vector<double>& dx) const;
 
   /// Largest displacement in a change of all points [m]; NaN counts as infinite.

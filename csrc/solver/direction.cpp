@@ -10,7 +10,8 @@ namespace diffcloth::solver {
 using stopping::kDirections;
 
 void Directions::make_room() {
-  // It would seldom be of use: where the next one fails, damped steps follow, which lead away.
+  // A large factor is seldom useful: if the next factorization fails, damped steps follow, which lead
+  // away.
   if (last_.factor && last_.factor->bytes() > walk_.context.options.large_factor) last_ = {};
 }
 
@@ -50,7 +51,7 @@ Factor Directions::solve_downhill(Factor factor, const linalg::BlockMatrix& A) {
   solve(*factor, A);
   slope_ = dot(walk_.g(), p_);
   if (slope_ <= 0.0 || factor->precision() == linalg::Precision::kDouble) return factor;
-  // Single precision has turned it: what a positive matrix makes of a gradient descends.
+  // Rounding in single precision: with a positive definite matrix, the direction would descend.
   walk_.context.single.was_wrong = true;
   factor = nullptr;  // never two at once
   factor = walk_.system.factor_in_doubles(A);
@@ -107,7 +108,8 @@ bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
   double forcing = kDirections.forcing;
   int iterations = kDirections.iterations;
   if (is_dear()) {
-    // Far from the solution what is left of the direction is to be no longer than it may be near there.
+    // Far from the solution, the remaining error of the direction must be no longer than it may be near
+    // there.
     const double far = walk_.displacement(p_) / (kDirections.near * walk_.f.length);
     forcing = kDirections.forcing_of_expensive / std::max(far, 1.0);
     const auto worth =
@@ -135,7 +137,7 @@ bool Directions::project() {
 }
 
 bool Directions::certify() {
-  // Whatever was near is of no use where this is indefinite: it is a saddle.
+  // A nearby factor is of no use if the Hessian is indefinite: the point is a saddle.
   last_ = {};
   last_ = walk_.system.certify(walk_.x().data(), walk_.g(), p_);
   confirmed_ = true;
@@ -174,7 +176,7 @@ std::optional<Directions::Direction> Directions::next() {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {
       if (!has_duals) return Direction{.kind = Kind::kFactored, .first = 1.0};
-      leave();  // it says nothing of the exact one
+      leave();  // not a factor of the exact Hessian
       return Direction{.kind = Kind::kPrimalDual, .first = 1.0};
     }
     s_ = kDirections.first_share;
@@ -199,7 +201,7 @@ bool Directions::descend(const linalg::BlockMatrix& A, bool doubts) {
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
                                                       const linalg::BlockMatrix& P) {
   make_room();
-  double curvature = 0.0;  // of the exact quadratic along p
+  double curvature = 0.0;  // curvature of the exact quadratic model along p
   for (;;) {
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;
@@ -215,7 +217,7 @@ std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix&
     }
   }
   ++walk_.context.counts->projected;
-  // The minimum of that quadratic; beyond any bound where its curvature is negative.
+  // The minimum of the quadratic model; the largest growth if its curvature is negative.
   const double best = curvature > 0.0 ? -slope_ / curvature : kDirections.largest_growth;
   return Direction{
       .kind = Kind::kDamped,

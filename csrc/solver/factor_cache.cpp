@@ -13,7 +13,7 @@ std::size_t KeptSolves::bytes() const {
 }
 
 void KeptSolves::add(Certificate certificate) {
-  // A certificate above the limit would be evicted at once, and holds memory meanwhile.
+  // A certificate above the limit would be evicted at once, but hold memory meanwhile.
   if (certificate.bytes() > FactorCache::kBytes) certificate = {};
   certificates.push_back(std::move(certificate));
 }

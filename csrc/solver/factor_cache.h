@@ -11,10 +11,10 @@
 
 namespace diffcloth::solver {
 
-/// Certificates and contacts of the solves of one step, kept for backward. They are functions of the
+/// Certificates and contacts of the solves of one step, kept for backward. Both are functions of the
 /// inputs and the tape: recomputed if evicted, with the same bits.
 struct KeptSolves {
-  // Both in the order that the scheme chooses.
+  // Both in the order of the scheme.
   std::vector<Certificate> certificates;
   std::vector<std::vector<contact::Contact>> contacts;
 
@@ -37,7 +37,7 @@ class FactorCache {
 
   FactorCache() : room_(std::make_shared<Room>()) {}
 
-  /// Keep solves while their ticket lives, and there is room.
+  /// Keep solves as long as their ticket lives and the bound on bytes allows.
   std::unique_ptr<Ticket> insert(KeptSolves kept);
 
   void clear() { room_->shrink(0); }
@@ -60,14 +60,14 @@ class FactorCache {
     std::list<Entry> entries;  // oldest first
     std::size_t bytes = 0;
 
-    /// Drop the oldest until no more than this is left.
+    /// Drop the oldest entries until at most `largest` bytes are left.
     void shrink(std::size_t largest);
   };
 
   std::shared_ptr<Room> room_;
 };
 
-/// The right to the kept solves of one step.
+/// Access to the kept solves of one step, which are dropped with it.
 class FactorCache::Ticket {
  public:
   ~Ticket();

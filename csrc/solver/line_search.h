@@ -9,38 +9,40 @@ namespace diffcloth::solver {
 
 enum class SearchResult : std::uint8_t {
   kMoved,
-  kBlocked,  ///< collision detection leaves no way to go
-  kNoGain,   ///< no point along the way is lower, as far as rounding can tell
+  kBlocked,  ///< collision detection leaves no part of the direction
+  kNoGain,   ///< no point along the direction is lower, as far as rounding allows to measure
 };
 
 struct Search {
   SearchResult result = SearchResult::kNoGain;
-  double alpha = 0.0;  ///< fraction of the direction that was walked
+  double alpha = 0.0;  ///< fraction of the direction that was accepted
   double gain = 0.0;   ///< change of the objective [J]
   int backtracks = 0;
-  bool measured = true;  ///< the decrease was larger than what rounding can fake
+  bool measured = true;  ///< the decrease exceeded the noise of rounding
 };
 
-/// The first point that a search along a direction looks at.
+/// First trial point of a search along a direction.
 struct Trial {
-  double alpha = 0.0;      ///< fraction of the direction; 0 where collisions leave no way
+  double alpha = 0.0;      ///< fraction of the direction; 0 if collisions leave no part of it
   std::vector<double> to;  ///< the point
   double gain = 0.0;       ///< change of the objective [J]
 
-  /// The change that is decrease enough (Armijo), from the slope along the direction [J].
+  /// Change of the objective that is a sufficient decrease (Armijo), for a slope along the direction
+  /// [J].
   double enough(double slope) const;
 };
 
-/// The largest collision-free fraction of p, at most the first.
+/// Trial point at the largest collision-free fraction of p, at most `first`.
 Trial farthest(Walk& walk, const std::vector<double>& p, double first);
 
-/// Whether rounding can fake a change of the objective, where the walk stands.
+/// True if rounding may account for a change of the objective at the current iterate.
 bool drowns(Walk& walk, double change);
 
-/// Walk along p by the largest collision-free fraction that decreases the objective enough
-/// (Armijo), or, where the change drowns in rounding, flattens its slope (approximate Wolfe).
+/// Backtracking line search along p: accept the largest collision-free fraction that decreases the
+/// objective sufficiently (Armijo) or, if the change drowns in rounding, flattens its slope (approximate
+/// Wolfe).
 ///
-/// @param trial  where to begin: what farthest() has found
+/// @param trial  first trial point, from farthest()
 Search search(Walk& walk, const std::vector<double>& p, Trial trial);
 
 }  // namespace diffcloth::solver

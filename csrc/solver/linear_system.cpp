@@ -11,7 +11,7 @@
 namespace diffcloth::solver {
 namespace {
 
-/// A fixed right side without symmetry, with numbers of the size of the diagonal's root.
+/// A fixed right side without symmetry, with entries of the size of the square root of the diagonal.
 std::vector<double> probe(const linalg::BlockValues& matrix) {
   const linalg::BlockPattern& pattern = matrix.pattern();
   std::vector<double> b(3 * static_cast<std::size_t>(pattern.size()));
@@ -41,7 +41,7 @@ linalg::BlockMatrix LinearSystem::assemble(const double* x,
   linalg::BlockMatrix matrix({pattern_, &pattern_->merged}, f_.patterns->fixed(),
                              &f_.coordinates->attachments());
   f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
-  // The positive one does without: what points do along their curves may be of any sign.
+  // The positive Hessian omits the curvature of the paths of points, whose sign is arbitrary.
   if (curvature != Curvature::kPositive) f_.coordinates->add_curvature(x, g, matrix);
   return matrix;
 }
@@ -103,7 +103,7 @@ bool LinearSystem::agrees(const Certificate& certificate,
   std::vector<double> b = probe(*certificate.hessian);
   std::vector<double> z(b.size(), 0.0);
   certificate.factor->solve(b.data(), z.data(), workspace_);
-  // The gradient with as much weight, and the step that the factor has made of it.
+  // Add the gradient with the same weight, and the step that the factor yields for it.
   f_.coordinates->pull_back(g, b_);
   f_.coordinates->take_rows(p, z_);
   const double own = -linalg::dot(z_, b_);
@@ -134,7 +134,7 @@ void LinearSystem::refine(const linalg::CholeskyFactor& factor,
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
   f_.coordinates->pull_back(b, b_);
   f_.coordinates->take_rows(p, z_);
-  matrix.add_product(z_.data(), b_.data());  // b + A p: what is left
+  matrix.add_product(z_.data(), b_.data());  // b + A p: the residual
   std::vector<double> change(z_.size(), 0.0);
   factor.solve(b_.data(), change.data(), workspace_);
   for (std::size_t a = 0; a < z_.size(); ++a) z_[a] -= change[a];

@@ -13,7 +13,7 @@ using stopping::kPrescribedMotion;
 
 namespace {
 
-/// Change of what is prescribed to its ends, and of what follows it; zero elsewhere.
+/// Change of the prescribed points to their ends, and of the points that follow them; zero elsewhere.
 std::vector<double> prescribed_change(const Walk& walk, const std::vector<double>& ends) {
   const Coordinates& coordinates = *walk.f.coordinates;
   std::vector<double> d(ends.size(), 0.0);
@@ -31,7 +31,7 @@ void add_coupling(const Objective& f,
                   const std::vector<double>& x,
                   const std::vector<double>& d,
                   std::vector<double>& g) {
-  // The matrix holds the couplings with pins and prescribed coordinates that the base pattern has.
+  // The matrix holds the couplings with pins and prescribed coordinates that are in the base pattern.
   std::vector<double> d_z;
   f.coordinates->take_rows(d, d_z);
   std::vector<double> product(d_z.size(), 0.0);
@@ -44,13 +44,13 @@ void add_coupling(const Objective& f,
   });
 }
 
-/// Go along the change p by its collision-free fraction, towards the ends. Returns that fraction.
+/// Move along the change p by its collision-free fraction, towards the ends. Returns that fraction.
 double follow(Walk& walk, const std::vector<double>& ends, const std::vector<double>& p) {
   std::vector<double> to;
   const double alpha = walk.watch(p, std::min(1.0, walk.f.largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) return 0.0;
   if (alpha == 1.0) {
-    // To the bit: vertices of links follow nodes that differ from these ends by rounding.
+    // Exact to the bit: the vertices of links follow nodes, and differ from these ends by rounding.
     for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
       if (walk.f.coordinates->prescribed()[i] == 0) continue;
       for (Index a = 3 * i; a < 3 * i + 3; ++a) to[a] = ends[a];
@@ -62,21 +62,21 @@ double follow(Walk& walk, const std::vector<double>& ends, const std::vector<dou
   return alpha;
 }
 
-/// Descend with the projected Hessian P, then go towards the ends. Returns the fraction of the remaining
-/// motion d that is covered.
+/// Descend with the projected Hessian P, then move towards the ends. Returns the covered fraction of the
+/// remaining motion d.
 ///
 ///   P p = -g        along a line search, prescribed points at rest
 ///   P q = -P_xo d   jointly with d
 ///
-/// Their sum is the joint Newton step. Separately, q and d vanish together, so that the end is a continuous
-/// function of d, at d = 0 as well.
+/// Their sum is the joint Newton step. Separately, q and d vanish together, so that the end is a
+/// continuous function of d, also at d = 0.
 ///
 /// @param descends  false: p is left out
 double descend_and_follow(Walk& walk, const std::vector<double>& ends, bool descends) {
   const std::vector<double> d = prescribed_change(walk, ends);
   const linalg::BlockMatrix matrix =
       walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
-  // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
+  // M/h^2 plus positive semi-definite parts: positive definite up to rounding.
   const Factor factor = walk.system.factor(matrix);
   if (!factor) return follow(walk, ends, d);
   ++walk.context.counts->projected;
@@ -94,7 +94,7 @@ double descend_and_follow(Walk& walk, const std::vector<double>& ends, bool desc
   return follow(walk, ends, q);
 }
 
-/// A point on the way, and the fraction of the whole motion there, less than one.
+/// An iterate during the motion, and the fraction of the whole motion there, less than one.
 struct Stop {
   Walk::Place place;
   double fraction;
@@ -110,9 +110,9 @@ bool has_arrived(const Walk& walk, const PrescribedMotion& motion) {
   return true;
 }
 
-/// Go back to the last of these at which what is prescribed can have the place that its motion gives it.
+/// Restore the last iterate from which the prescribed points can be placed on their motion.
 ///
-/// @return the fraction there; 1 where the motion has no length, of which nothing can be missing
+/// @return the fraction there; 1 if the motion has no length, as nothing can be missing
 double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>& way) {
   for (const Stop& stop : std::views::reverse(way)) {
     walk.back(stop.place);
@@ -126,7 +126,7 @@ double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>&
   return has_arrived(walk, motion) ? 1.0 : way.front().fraction;
 }
 
-/// Walk all portions; what was passed in the last one is written to `way`.
+/// Move through all portions; the iterates of the last portion are written to `way`.
 double go_to_the_end(Walk& walk,
                      const PrescribedMotion& motion,
                      bool descends,
@@ -139,11 +139,11 @@ double go_to_the_end(Walk& walk,
     double checked = 1.0;
     way.clear();
     for (int iteration = 1; remaining > 0.0; ++iteration) {
-      // What is left may drown in rounding, where things approach one another without end.
+      // The remaining part may drown in rounding, if surfaces approach one another without end.
       const double fraction = std::min((k + 1.0 - remaining) / portions, std::nextafter(1.0, 0.0));
       way.push_back({.place = walk.place(), .fraction = fraction});
       if (!walk.spend()) return halt(walk, motion, way);
-      // Where a motion is blocked, a descent reopens the gaps.
+      // If a motion is blocked, a descent reopens the gaps.
       const double alpha = descend_and_follow(walk, ends, descends || iteration > 1);
       remaining *= 1.0 - alpha;
       if (iteration % kPrescribedMotion.stuck_iterations == 0) {
@@ -158,12 +158,12 @@ double go_to_the_end(Walk& walk,
 }  // namespace
 
 double arrive(Walk& walk, const PrescribedMotion& motion, bool descends) {
-  // Without a descent and a motion nothing is left to do: a solution stays where it is, to the bit.
+  // Without a descent and a motion, a solution must stay unchanged to the bit.
   if (!descends && has_arrived(walk, motion)) return 1.0;
   std::vector<Stop> way;
   try {
     return go_to_the_end(walk, motion, descends, way);
-  } catch (const TimeIsUp&) {  // in a portion, whose start is on the way
+  } catch (const TimeIsUp&) {  // in a portion, whose start is in `way`
     walk.context.checkpoint->stop_clock();
     return halt(walk, motion, way);
   }

@@ -58,7 +58,7 @@ class Descent {
 
   Walk& walk_;
   Directions directions_;
-  double goal_;  ///< largest step that counts as converged [m]
+  double goal_;  ///< step below which the solve has converged [m]
   Criterion criterion_ = Criterion::kIterationLimit;
   double residual_ = 0.0;
   bool settling_ = false;  ///< the last step was below the goal
@@ -67,29 +67,29 @@ class Descent {
   double best_ = std::numeric_limits<double>::infinity();
   int idle_ = 0;
 
-  /// Steps that may raise the objective, as long as they end below where they began.
+  /// Steps that may raise the objective if the last one ends below the start.
   ///
-  /// Stiff cloth moves in a curved valley: a step along its tangent stretches it, and a search that
-  /// only goes down takes hundreds of short ones. But the next Newton step relaxes what the last one
-  /// has stretched, and goes on along the valley, provided that its Hessian has the stresses of the
-  /// linear model of that step, which stretches nothing, and not the spurious ones (Magisano,
+  /// Stiff cloth moves in a curved valley: a step along its tangent stretches the cloth, and a search
+  /// with monotone decrease takes hundreds of short steps. The next Newton step, however, relaxes the
+  /// stretch of the last one and continues along the valley, provided that its Hessian has the stresses
+  /// of the linear model of that step, which stretches nothing, and not the spurious ones (Magisano,
   /// Leonetti, Garcea 2017: Newton's method with mixed integration points).
   struct Excursion {
     Walk::Place start;
     std::vector<double> p;  ///< the first direction
     Directions::Direction direction;
-    double share = 0.0;    ///< of the projection, at the start
+    double share = 0.0;    ///< share of the projection at the start
     double enough = 0.0;   ///< change to end with [J]
     double balance = 0.0;  ///< change so far [J]
     int steps = 0;
   };
-  bool away_ = false;  ///< on an excursion
+  bool away_ = false;  ///< true on an excursion
   Excursion excursion_;
-  int wait_ = kExcursions.patience;  ///< ordinary steps before the next one
-  int next_wait_ = 1;                ///< after the next one in vain
+  int wait_ = kExcursions.patience;  ///< ordinary steps before the next excursion
+  int next_wait_ = 1;                ///< ordinary steps after the next failed excursion
 };
 
-/// Leave a saddle, or stop there.
+/// Leave a saddle, or end the solve there.
 Descent::Next Descent::escape() {
   if (!leave_saddle(walk_)) return stop(Criterion::kSaddle);
   directions_.restart();
@@ -98,29 +98,30 @@ Descent::Next Descent::escape() {
   return Next::kGoOn;
 }
 
-/// Factor the exact Hessian here, where the gradient is as good as zero: converged, one more step, or
-/// a saddle.
+/// Factor the exact Hessian where the gradient is practically zero: the solve has converged, or one more
+/// step or a descent from a saddle follows.
 Descent::Next Descent::settle() {
   settling_ = false;
   if (!directions_.certify()) return escape();
   return take({.kind = Kind::kFactored, .first = 1.0});
 }
 
-/// Whether a step below the goal is not worth taking.
+/// True if a step below the goal is not worth taking.
 bool Descent::is_settled(double step, double share) const {
   return step <= share * goal_ &&
          walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kNewton.force_change;
 }
 
-/// Whether the end of a step below the goal is to be certified. A chord is often shorter than the step
-/// that it stands for: where that leaves more than may be left, a dear factor would be made twice.
+/// True if the end of a step below the goal should be certified. A chord step is often shorter than the
+/// Newton step that it approximates: if the remaining error is too large, an expensive factorization
+/// would be repeated.
 bool Descent::may_end(const Directions::Direction& direction, double step) const {
   const bool doubtful = direction.kind == Kind::kChord && step > kNewton.settled_factored * goal_;
   return !(doubtful && directions_.is_dear());
 }
 
-/// Whether a step below the goal may end the solve without a certificate: it is a Newton or chord step of a
-/// definite exact Hessian, and turns no contact from sticking to slipping.
+/// True if a step below the goal may end the solve without a certificate: a Newton or chord step of a
+/// definite exact Hessian that turns no contact from sticking to slipping.
 bool Descent::may_end_uncertified(const Directions::Direction& direction) const {
   if (walk_.context.options.certify || away_ || directions_.is_certified()) return false;
   const bool exact = direction.kind == Kind::kFactored || direction.kind == Kind::kIterated ||
@@ -129,12 +130,12 @@ bool Descent::may_end_uncertified(const Directions::Direction& direction) const 
          walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kNewton.force_change;
 }
 
-/// Whether rounding of the coordinates hides a step.
+/// True if rounding of the coordinates hides a step.
 bool Descent::is_lost(double step) const {
   return !(step > kNewton.resolution * walk_.f.coordinates->extent(walk_.x()));
 }
 
-/// Whether steps have stopped to shrink while their gain drowns in rounding.
+/// True if steps no longer shrink while their gain drowns in rounding.
 bool Descent::idles(double step, const Search& search) {
   if (step < kNewton.progress * best_ || search.measured) {
     idle_ = 0;
@@ -145,7 +146,7 @@ bool Descent::idles(double step, const Search& search) {
   return idle_ >= kNewton.idle_steps;
 }
 
-/// The direction cannot be walked.
+/// Handle a direction without an acceptable step.
 Descent::Next Descent::no_way(const Directions::Direction& direction,
                               double step,
                               SearchResult result) {
@@ -164,7 +165,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
   return stop(result == SearchResult::kBlocked ? Criterion::kBlocked : without_gain);
 }
 
-/// Whether an excursion may go so far.
+/// True if a step of this length is allowed on an excursion.
 bool Descent::is_near(const std::vector<double>& p) const {
   const Coordinates& coordinates = *walk_.f.coordinates;
   const double farthest = kExcursions.farthest * walk_.f.length;
@@ -174,7 +175,7 @@ bool Descent::is_near(const std::vector<double>& p) const {
   return coordinates.cloth_vertex_count() > 0;
 }
 
-/// Walk along the direction. Where the full step would raise the objective it may begin an excursion.
+/// Search along the direction. If the full step would raise the objective, it may begin an excursion.
 Search Descent::walk_along(const Directions::Direction& direction) {
   const std::vector<double>& p = directions_.p();
   Trial trial = farthest(walk_, p, direction.first);
@@ -182,7 +183,7 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   const double enough = trial.enough(slope);
   const bool rises = slope < 0.0 && trial.alpha > kExcursions.free && std::isfinite(trial.gain) &&
                      trial.gain > enough;
-  // The next step relaxes what this one stretches, but not what it drives into barriers.
+  // The next step relaxes the stretch of this one, but cannot undo motion into barriers.
   const bool touches = walk_.f.contact != nullptr && !walk_.f.contact->contacts().empty();
   const bool far = !touches || walk_.displacement(p) > kExcursions.far * walk_.f.length;
   if (wait_ == 0 && direction.kind != Kind::kDamped && far && is_near(p) && rises &&
@@ -199,7 +200,7 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   return search(walk_, p, std::move(trial));
 }
 
-/// One step of an excursion: its last one where it ends below the start, none where it leads nowhere.
+/// One step of an excursion. The excursion ends if the step ends below its start; no step if it fails.
 Search Descent::wander(const Trial& trial) {
   const double balance = excursion_.balance + trial.gain;
   const bool ends = trial.alpha > 0.0 && balance <= excursion_.enough;
@@ -218,7 +219,7 @@ Search Descent::wander(const Trial& trial) {
   return {.result = SearchResult::kMoved, .alpha = trial.alpha, .gain = trial.gain};
 }
 
-/// Undo an excursion, and go on from its start in the ordinary way.
+/// Undo an excursion, and continue from its start with ordinary steps.
 Descent::Next Descent::come_back() {
   away_ = false;
   wait_ = next_wait_;
@@ -239,10 +240,10 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   if (direction.kind == Kind::kFactored && step < goal_ && !directions_.is_certified()) {
     residual_ = step / walk_.f.h;
     if (!directions_.confirm()) return escape();
-    step = walk_.displacement(directions_.p());  // of doubles, perhaps
+    step = walk_.displacement(directions_.p());  // maybe that of a factor in doubles
   }
   const bool lost = is_lost(step);
-  // A minimum above the start of an excursion is none to end in.
+  // An excursion must not end in a minimum above its start.
   if (away_ && (step < goal_ || lost)) return come_back();
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
@@ -266,9 +267,9 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   return go(direction);
 }
 
-/// Walk along the direction, and learn from it.
+/// Step along the direction, and update the direction's state from the search.
 ///
-/// @param is_last  whether the solve ends, uncertified, once the step is taken
+/// @param is_last  true if the solve ends, uncertified, after this step
 Descent::Next Descent::go(const Directions::Direction& direction, bool is_last) {
   const double step = walk_.displacement(directions_.p());
   const Search search =
@@ -290,19 +291,19 @@ Descent::Next Descent::go(const Directions::Direction& direction, bool is_last) 
   return Next::kGoOn;
 }
 
-/// There is no Newton step to measure.
+/// The criterion if no Newton step can be computed.
 Criterion Descent::without_step() {
   residual_ = std::numeric_limits<double>::infinity();
   const bool finite = std::ranges::all_of(walk_.g(), [](double g) { return std::isfinite(g); });
   return finite ? Criterion::kIndefinite : Criterion::kNotFinite;
 }
 
-/// What is here when the iterations or the time are used up: the residual of this very point.
+/// Evaluate the final iterate when iterations or time are used up: residual and criterion of this point.
 Criterion Descent::look() {
   if (away_) walk_.back(excursion_.start);
   const bool is_late = walk_.context.checkpoint->is_up();
   const bool minimum = directions_.certify();
-  // Shifts of an indefinite Hessian take many factorizations, for which no time is left.
+  // Shifts of an indefinite Hessian need many factorizations, for which no time is left.
   const bool has_step =
       minimum || (is_late ? directions_.project() : directions_.next().has_value());
   if (!has_step) return without_step();
@@ -345,7 +346,7 @@ Criterion Descent::descend() {
 
 using FreeBodies = std::vector<const bodies::Mechanisms::FreeBody*>;
 
-/// Leave out those that meet something on the straight motion from where the walk stands.
+/// Remove the bodies that meet something on the straight motion from the current iterate.
 void leave_out_meeting(Walk& walk, const std::vector<double>& to, FreeBodies& bodies) {
   if (walk.f.contact == nullptr || bodies.empty()) return;
   const std::vector<char> meets = walk.meeting(to);
@@ -354,15 +355,15 @@ void leave_out_meeting(Walk& walk, const std::vector<double>& to, FreeBodies& bo
   });
 }
 
-/// Whether friction resists the way from where the walk stands. What a grip holds, say, is not to begin
-/// where inertia alone would lead, out of the grip: its fingers would close behind it.
+/// True if friction opposes the motion from the current iterate. An object in a grip, for example, must
+/// not begin at its inertial guess outside the grip: the fingers would close behind it.
 bool is_resisted(const Walk& walk, const std::vector<double>& to) {
   return walk.f.friction->energy_change(walk.x().data(), to.data()) > 0.0;
 }
 
-/// Where the walk stands, but for the free bodies that come to their places in the guess without meeting
-/// anything or rubbing on it: nothing else knows of these, so that what else there is should not wait for
-/// them.
+/// The current iterate, with the free bodies at their guess that reach it without contact or friction:
+/// no potential but contact couples them to the rest, so the rest of the scene should not hold them
+/// back.
 std::vector<double> with_flown_bodies(Walk& walk, const std::vector<double>& guess) {
   const std::vector<double>& start = walk.x();
   const Coordinates& coordinates = *walk.f.coordinates;
@@ -392,7 +393,7 @@ std::vector<double> with_flown_bodies(Walk& walk, const std::vector<double>& gue
   leave_out_meeting(walk, guess, flying);
   while (!flying.empty()) {
     std::vector<double> flown = with(flying);
-    // What stays behind may be in the way of what would have followed it.
+    // A body that stays behind may block another that would have followed it.
     const std::size_t before = flying.size();
     leave_out_meeting(walk, flown, flying);
     if (flying.size() == before) return flown;
@@ -400,12 +401,12 @@ std::vector<double> with_flown_bodies(Walk& walk, const std::vector<double>& gue
   return start;
 }
 
-/// Start from the guess instead of x where that is better and the straight way there free of contact; or
-/// at least free bodies that meet nothing.
+/// Begin at the guess instead of x if it is better and the straight path to it free of contact;
+/// otherwise move at least the free bodies that meet nothing.
 bool start_from(Walk& walk, const std::vector<double>& guess) {
   const std::vector<double> flown = with_flown_bodies(walk, guess);
-  // Where inertia alone would collapse the cloth (long steps, forces on light vertices), the start
-  // of the step with pins at their ends is the better place to begin.
+  // If inertia alone would collapse the cloth (long steps, forces on light vertices), the start of the
+  // step with pins at their ends is the better initial iterate.
   std::vector<double> held = guess;
   const Coordinates& coordinates = *walk.f.coordinates;
   for (Index i = 0; i < coordinates.row_count(); ++i) {
@@ -415,7 +416,7 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   }
   coordinates.place(held);
   const auto is_better_and_free = [&] {
-    // Written so that a change that is not a number, of strains beyond all numbers, is no gain.
+    // This form rejects a change of NaN, from strains that overflow.
     if (!(walk.f.energy_change_without_contact(held.data(), guess.data()) <= 0.0)) return false;
     if (walk.f.friction != nullptr && is_resisted(walk, guess)) return false;
     std::vector<double> change(guess.size());
@@ -438,7 +439,7 @@ Criterion end_of_motion(const Context& context) {
   return is_used_up ? Criterion::kIterationLimit : Criterion::kStuckMotion;
 }
 
-/// Find the contacts of the current iterate, also when the time of the step is up.
+/// Compute the contacts of the current iterate, also when the time of the step is up.
 void watch_here(Walk& walk) {
   try {
     walk.watch(walk.x());
@@ -467,8 +468,8 @@ Outcome minimize(const Objective& objective,
   if (!guessed) watch_here(walk);
   walk.refresh();
   if (departure != nullptr && !guessed) {
-    // A stiff drive at its limit balances within rounding: exact steps alternate there between two points
-    // without end. The projection has more curvature, and its step ends between them.
+    // A stiff drive at its limit balances within rounding: exact steps would alternate between two
+    // points forever. The projected Hessian has more curvature, and its step ends between them.
     const bool descends = departure->guess != nullptr ||
                           (objective.chart != nullptr && objective.chart->has_joint_terms());
     outcome.motion_fraction = arrive(walk, departure->motion, descends);

@@ -10,12 +10,12 @@
 namespace diffcloth::solver {
 namespace {
 
-/// Couplings of points as sorted ones of rows that the base pattern lacks.
+/// Couplings of points as sorted couplings of rows that the base pattern lacks.
 linalg::Couplings beyond_base(const Objective& f, linalg::Couplings points) {
   return linalg::beyond(f.patterns->base(), f.coordinates->couplings_of_rows(std::move(points)));
 }
 
-/// Sorted couplings of both.
+/// Sorted union of two lists of couplings.
 linalg::Couplings united(const linalg::Couplings& a, const linalg::Couplings& b) {
   linalg::Couplings all;
   all.reserve(a.size() + b.size());
@@ -32,7 +32,7 @@ std::vector<double> Objective::metric() const {
   std::vector<double> result;
   for (const double m : inertia->metric()) result.insert(result.end(), 3, m / (h * h));
   if (chart != nullptr) chart->append_diagonal(result);
-  // Rows of prescribed coordinates alone are fixed.
+  // Rows whose coordinates are all prescribed are fixed.
   result.resize(coordinates->size(), 0.0);
   return result;
 }

@@ -15,31 +15,31 @@
 
 namespace diffcloth::solver {
 
-/// What a solve minimizes: a sum of potentials over all points  [J].
+/// Objective of a solve: a sum of potentials over all points [J].
 ///
-/// The potentials are the caller's. Some of them have a further role: inertia and the coordinates'
-/// potential, whose metrics are the scale of shifts and speeds, and contact, which watches motions.
+/// The caller owns the potentials. Some have a further role: the metrics of inertia and of the
+/// coordinates' potential scale shifts and speeds, and contact detects collisions along motions.
 struct Objective {
   Coordinates* coordinates;
   double h;       ///< time step [s]
   double length;  ///< mean edge of the cloths [m]
   Proximity* inertia;
-  std::vector<Potential*> others;                ///< everything but inertia, friction and contact
-  Potential* friction = nullptr;                 ///< null where nothing touched
-  contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
-  bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
-  /// Bodies of which nothing but contact and `chart`, a quadratic form for them, knows.
+  std::vector<Potential*> others;                ///< all but inertia, friction and contact
+  Potential* friction = nullptr;                 ///< null if nothing touched
+  contact::ContactPotential* contact = nullptr;  ///< null if nothing can touch
+  bodies::CoordinatePotential* chart = nullptr;  ///< potential of free coordinates; may be null
+  /// Bodies on which only contact and `chart`, a quadratic form for them, depend.
   std::span<const bodies::Mechanisms::FreeBody> free_bodies;
   PatternCache* patterns;
-  linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in pattern()
+  linalg::Couplings expected;  ///< couplings beyond the base pattern, sorted: always in pattern()
 
-  /// Those of friction alone, which last as long as it does; empty until they are asked for.
+  /// Couplings of friction alone, valid as long as `friction`; empty until first used.
   mutable std::optional<linalg::Couplings> of_friction;
 
-  /// The last result of pattern(), and the couplings of points that it was found for.
+  /// Last result of pattern(), with the couplings of points as its key.
   struct KnownPattern {
     linalg::Couplings points;
-    std::shared_ptr<const AnalyzedPattern> pattern;  ///< null where none is known
+    std::shared_ptr<const AnalyzedPattern> pattern;  ///< null if none is known
   };
   mutable KnownPattern known_pattern;
 
@@ -76,7 +76,7 @@ struct Objective {
     return change;
   }
 
-  /// The same without friction and contact.
+  /// The change of energy without friction and contact.
   double energy_change_without_contact(const double* x, const double* to) const {
     double change = inertia->energy_change(x, to);
     if (chart != nullptr) change += chart->energy_change(x, to);
@@ -95,7 +95,8 @@ struct Objective {
     return change;
   }
 
-  /// Whether a potential has duals of this point, so that the Hessian kPrimalDual is not the exact one.
+  /// True if a potential has duals at this point, so that the Hessian kPrimalDual differs from the exact
+  /// one.
   bool has_duals(const double* x) const {
     bool any = false;
     for_each([&](const Potential& p) { any = any || p.has_duals(x); });
@@ -117,21 +118,21 @@ struct Objective {
     for_each([&](const Potential& p) { p.add_hessian_product(x, z, y.data()); });
   }
 
-  /// The same at all points but the cloths' free vertices; what those get means nothing.
+  /// The product at all points but the cloths' free vertices, whose entries have no meaning.
   void held_product(const double* x, const double* z, std::vector<double>& y) const {
     y.assign(3 * static_cast<std::size_t>(coordinates->point_count()), 0.0);
     for_each([&](const Potential& p) { p.add_held_product(x, z, y.data()); });
   }
 
-  /// What shifts of a Hessian are measured in, one for each number of a row: M / h^2 of vertices, the
-  /// diagonal of the metric of coordinates.
+  /// Metric for shifts of a Hessian, one entry for each number of a row: M / h^2 for vertices, the
+  /// diagonal of the coordinates' metric for coordinates.
   std::vector<double> metric() const;
 
-  /// Pattern of the Hessian at the point where the objective stands. Most iterates have the couplings of the
-  /// one before, and its pattern.
+  /// Pattern of the Hessian at the current point. Most iterates have the couplings of the previous one,
+  /// and reuse its pattern.
   std::shared_ptr<const AnalyzedPattern> pattern() const;
 
-  /// Expect couplings of points, in place of those expected so far.
+  /// Replace the expected couplings, given as couplings of points.
   void expect(linalg::Couplings points);
 };
 

@@ -28,7 +28,7 @@ std::shared_ptr<const AnalyzedPattern> PatternCache::find(const linalg::Coupling
     }
   }
   const auto pattern = std::make_shared<const AnalyzedPattern>(base(), fixed_, pairs);
-  // The analysis, which may come later, holds about five times as many indices as the pattern.
+  // The analysis, which may be computed later, holds about five times as many indices as the pattern.
   const std::vector<Index>& row = pattern->merged.pattern.row();
   const std::size_t bytes = sizeof(pairs.front()) * pairs.size() + 12 * sizeof(Index) * row.size();
   const std::lock_guard lock(mutex_);

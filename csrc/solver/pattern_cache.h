@@ -11,7 +11,7 @@
 
 namespace diffcloth::solver {
 
-/// A matrix pattern with contacts in it, and its symbolic factorization, made when first asked for.
+/// A matrix pattern that includes contacts, and its symbolic factorization, computed at first use.
 class AnalyzedPattern {
  public:
   AnalyzedPattern(const linalg::BlockPattern& base,
@@ -23,7 +23,7 @@ class AnalyzedPattern {
 
   struct Found {
     std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
-    bool is_new;  ///< made by this call
+    bool is_new;  ///< computed by this call
   };
   Found analysis() const;
 
@@ -33,11 +33,11 @@ class AnalyzedPattern {
   mutable std::shared_ptr<const linalg::CholeskyAnalysis> analysis_;
 };
 
-/// Patterns and symbolic factorizations seen before, by the couplings that contact adds to the base
+/// Known patterns and symbolic factorizations, keyed by the couplings that contact adds to the base
 /// pattern.
 ///
-/// Only a memory, bounded in bytes: an entry is a function of its key, so results do not depend on
-/// what is in it.
+/// A cache bounded in bytes: an entry is a function of its key, so results do not depend on the contents
+/// of the cache.
 class PatternCache {
  public:
   PatternCache(const linalg::BlockPattern& base, std::vector<char> fixed);
@@ -60,7 +60,7 @@ class PatternCache {
   static constexpr std::size_t kCapacity = std::size_t{32} << 20;  // [bytes]
 
   std::vector<char> fixed_;
-  std::shared_ptr<const AnalyzedPattern> plain_;  ///< on the base pattern
+  std::shared_ptr<const AnalyzedPattern> plain_;  ///< base pattern alone
   std::mutex mutex_;
   std::list<Entry> entries_;  // most recent first
   std::size_t bytes_ = 0;

@@ -41,7 +41,7 @@ Factor shifted_factor(const std::vector<double>& metric,
   return nullptr;
 }
 
-/// Go to the first lower point along p, from far to near, and on while the next is lower still.
+/// Move to the first lower point along p, from far to near, and continue while the next is lower still.
 bool go_down(Walk& walk, const std::vector<double>& p) {
   const double length = kSaddle.first_move * walk.f.length;
   std::vector<double> to;
@@ -85,7 +85,7 @@ std::vector<double> most_negative(const Objective& f,
     const double size = f.coordinates->displacement(p);
     for (double& value : d) value /= size;
   }
-  // The largest entry decides the sign; of equal ones the first.
+  // The largest entry decides the sign; of equal entries, the first.
   const auto top = std::ranges::max_element(d, {}, [](double value) { return std::abs(value); });
   if (*top < 0.0) {
     for (double& value : d) value = -value;
@@ -103,7 +103,7 @@ bool leave_saddle(Walk& walk) {
   std::vector<double> p;
   walk.f.coordinates->push_forward(d, p);
   if (go_down(walk, p)) return true;
-  // What is left of the gradient may outweigh the curvature on one side.
+  // The remaining gradient may outweigh the curvature on one side.
   for (double& value : p) value = -value;
   return go_down(walk, p);
 }

@@ -49,8 +49,8 @@ struct Newton {
   double settled = 0.1;
   /// Share of the tolerance below which a certified step is not taken: its end needs another factorization.
   double settled_factored = 0.25;
-  /// Change of friction, as a share of the largest force, above which a step is taken however short it is:
-  /// a few times the tolerance turn sticking into slipping.
+  /// Change of friction, as a share of the largest force, above which even a short step is taken: a few
+  /// times the tolerance turn sticking into slipping.
   double force_change = 1e-3;
   /// Ratio of successive certified steps above which the remaining step is assumed to be rounding.
   double contraction = 0.5;
@@ -65,14 +65,14 @@ inline constexpr Newton kNewton;
 
 /// Excursions, which may raise the objective for some steps: newton.cpp.
 struct Excursions {
-  /// Steps that an excursion may take to end below its start: the valleys that it follows take fewer.
+  /// Steps within which an excursion must end below its start: the valleys that it follows need fewer.
   int steps = 6;
   /// Share that collisions must leave of each of its steps: shorter steps do not relax the stretch.
   double free = 0.3;
   /// Share of an edge that the first step must exceed in contact: barriers resist shorter ones.
   double far = 0.03;
-  /// Edges of the cloths that bodies and links may move in each step: friction would otherwise lead a body
-  /// that it holds around its support, into free fall.
+  /// Largest motion of bodies and links in each step, in edges of the cloths: otherwise friction would
+  /// lead a body that it holds around its support, into free fall.
   double farthest = 10.0;
   /// Steps of a solve before the first excursion: most solves end sooner.
   int patience = 8;
@@ -83,13 +83,13 @@ inline constexpr Excursions kExcursions;
 
 /// The line search: line_search.cpp.
 struct LineSearch {
-  /// Armijo's share of the decrease that the slope promises.
+  /// Armijo's share of the decrease that the slope predicts.
   double armijo = 1e-4;
   /// Share of the slope that must vanish if the decrease drowns in rounding (approximate Wolfe condition).
   double wolfe_slope = 0.8;
-  /// Change of the energy, relative to it, that rounding can fake.
+  /// Relative change of the energy for which rounding may account.
   double energy_noise = 1e-11;
-  /// Multiple of that noise which no rounding fakes, even where the work of friction is not known.
+  /// Multiple of that noise for which rounding cannot account, even if the work of friction is unknown.
   double clearly = 1e3;
   /// Halvings of the step, after which it is lost in the rounding of the coordinates.
   int backtracks = 40;
@@ -98,11 +98,11 @@ inline constexpr LineSearch kLineSearch;
 
 /// Collision-free steps along curves: walk.h.
 struct CurvedStep {
-  /// Share of the last free fraction that is tried next: the chord of each fraction is another one.
+  /// Share of the last free fraction for the next trial: each fraction has another chord.
   double shorter = 0.9;
-  /// Share of the first free fraction that is tried first: bends far away make no difference.
+  /// Share of the first free fraction for the first trial: distant bends make no difference.
   double barely_shorter = 1.0 - 1e-9;
-  /// Fractions that are tried before the direction counts as blocked.
+  /// Trial fractions before the direction counts as blocked.
   int trials = 60;
 };
 inline constexpr CurvedStep kCurvedStep;
@@ -125,13 +125,14 @@ struct Directions {
   double cheap_factor = 3e7;
   /// Most conjugate gradient iterations with an old factor: a new factor would be cheaper.
   int iterations = 8;
-  /// Relative residual at which these iterations end: Newton's method needs no more.
+  /// Relative residual at which these iterations end: Newton's method needs no higher accuracy.
   double forcing = 0.03;
-  /// Relative residual at which they end if a factor is expensive, as more iterations pay then.
+  /// Relative residual at which the iterations end if a factor is expensive, as more iterations pay
+  /// then.
   double forcing_of_expensive = 0.01;
-  /// Operations per entry of a factor that one iteration is worth, by its time.
+  /// Operations per entry of a factor that cost as much time as one iteration.
   double operations_per_iteration = 80.0;
-  /// Share of an edge that a full exact step may move a point by near a solution.
+  /// Largest displacement in a full exact step near a solution, as a share of an edge.
   double near = 0.03;
   /// Share s of the projection in the blend (H + s P) / (1 + s) after an indefinite Hessian.
   double first_share = 1.0;
@@ -153,7 +154,7 @@ struct Directions {
   double poor_gain = 0.1;
   /// Backtracks from which on the model is poor.
   int many_backtracks = 3;
-  /// Share of the projection's curvature that the blend must have along a far direction, to hold it.
+  /// Share of the projection's curvature that the blend must keep along a far direction.
   double held = 0.5;
   /// Fraction of a damped step from which on lengthening it pays.
   double worth_growing = 1.5;
@@ -166,46 +167,47 @@ inline constexpr Directions kDirections;
 struct Refinement {
   /// Relative residual at which a solve has reached rounding.
   double residual = 1e-12;
-  /// Iterations in which it must do so; a good factor takes three.
+  /// Largest number of iterations to reach that residual; a good factor takes three.
   int iterations = 30;
 };
 inline constexpr Refinement kRefinement;
 
 /// Conjugate gradients: linalg/conjugate_gradient.cpp.
 struct ConjugateGradients {
-  /// Contraction of the residual in an iteration that is seldom exceeded: a solve that needs more is given
-  /// up.
+  /// Contraction of the residual in an iteration that is seldom exceeded: a solve that would need faster
+  /// contraction is given up.
   double fastest = 2.5;
 };
 inline constexpr ConjugateGradients kConjugateGradients;
 
-/// Agreement of a factor in single precision with its matrix: the first iteration contracts the residual to a
-/// tenth, as the step must be right to a tenth, and a few more reach a residual that no negative direction allows.
+/// Agreement of a factor in single precision with its matrix. The first iteration must contract the
+/// residual to a tenth, as the step must be right to a tenth; the next ones must reach a residual that
+/// excludes a negative direction.
 inline constexpr linalg::Agreement kAgreement{
     .first_contraction = 0.1, .residual = 1e-4, .iterations = 6};
 
-/// The way of prescribed points to their ends: motion.cpp, step/schemes/motion.cpp.
+/// Motion of prescribed points to their ends: motion.cpp, step/schemes/motion.cpp.
 struct PrescribedMotion {
   /// Iterations after which the progress of a motion is checked.
   int stuck_iterations = 20;
-  /// Fraction of the motion below which that progress means that it is stuck.
+  /// Fraction of the motion below which the progress since the last check counts as stuck.
   double stuck_progress = 1e-3;
   /// Largest turn of a body in a portion of its motion [rad]: straight paths of its vertices would collapse it.
   double largest_turn = 10.0 * std::numbers::pi / 180.0;
 };
 inline constexpr PrescribedMotion kPrescribedMotion;
 
-/// The way out of a saddle: saddle.cpp.
+/// Descent from a saddle: saddle.cpp.
 struct Saddle {
-  /// First shift that shall make the Hessian definite, as a share of M/h^2.
+  /// First shift to make the Hessian definite, as a share of M/h^2.
   double first_shift = 0.1;
   /// Growth of the shift.
   double shift_growth = 4.0;
-  /// Shifts that are tried, up to 4e11.
+  /// Number of shifts, the last of them 4e11.
   int shifts = 22;
   /// Inverse iterations for the most negative direction.
   int inverse_iterations = 30;
-  /// Share of the mean edge that the first trial moves a vertex by.
+  /// Displacement of the first trial, as a share of the mean edge.
   double first_move = 0.25;
   /// Halvings of that move.
   int backtracks = 40;
@@ -214,24 +216,24 @@ inline constexpr Saddle kSaddle;
 
 /// Local/global iterations: projective/local_global.cpp, step/nodal/stage.cpp.
 struct LocalGlobal {
-  /// Iterations that are allowed for each of Newton's: one takes about as much less time.
+  /// Iterations allowed for each Newton iteration: the ratio of their times.
   std::int64_t iterations_per_newton = 50;
   /// Share of the largest coordinate below which a step is lost in rounding.
   double resolution = kNewton.resolution;
-  /// Change of the energy, relative to it, that rounding can fake; below, the slope decides.
+  /// Relative change of the energy for which rounding may account; below it, the slope decides.
   double energy_noise = kLineSearch.energy_noise;
-  /// Share of the slope that must vanish then.
+  /// Share of the slope that must vanish in that case.
   double wolfe_slope = kLineSearch.wolfe_slope;
   /// Iterations after which the scale of the energy is computed again.
   int energy_age = 50;
-  /// Iterations that neither shrink the residual nor gain more than noise, after which rounding is reached.
+  /// Iterations without a smaller residual or a gain above noise, after which rounding is reached.
   int idle_iterations = 1000;
   /// Ratio to the smallest residual so far below which a residual has shrunk.
   double progress = 0.9;
   /// Halvings of a plain step that raises the energy.
   int halvings = 40;
-  /// With contact at nodes, iterations that do not halve the residual, after which it stalls: on the way down
-  /// from a saddle it must grow, which these iterations do not allow.
+  /// With contact at nodes, iterations without halving the residual after which it stalls: on the path
+  /// down from a saddle the residual must grow, which these iterations do not allow.
   int stalled_iterations = 100;
 };
 inline constexpr LocalGlobal kLocalGlobal;
@@ -246,13 +248,13 @@ struct CoupledCoulomb {
   double angle = 1e-15;
   /// Sweeps between two attempts of Newton's method.
   int sweeps_per_polish = 20;
-  /// Steps of such an attempt.
+  /// Newton steps in such an attempt.
   int newton_steps = 10;
-  /// Ratio to the last residual below which such a step goes on.
+  /// Ratio to the last residual above which the attempt ends.
   double newton_contraction = 0.5;
   /// Sweeps after which contacts take half the share of their step: full steps may cycle.
   int sweeps_per_share = 100;
-  /// Least such share.
+  /// Smallest such share.
   double least_share = 0.125;
   /// Change of the impulses, relative to the largest, that is rounding.
   double rounding = 1e-14;
@@ -261,13 +263,13 @@ inline constexpr CoupledCoulomb kCoupledCoulomb;
 
 /// Newton's method with friction at nodes: step/nodal.
 struct Nodal {
-  /// Relative residual of a Newton direction: a smaller one would not shorten the way.
+  /// Relative residual of a Newton direction: a smaller one would not save steps.
   double direction_tolerance = 1e-4;
-  /// Ratio of squared residuals below which a Newton step is taken; else an energy leads.
+  /// Ratio of squared residuals below which a Newton step is accepted; otherwise an energy decides.
   double contraction = 0.25;
   /// Share of the tolerance below which a step is not taken, as in Newton.
   double settled = 0.1;
-  /// Steps down with the current cases of the law before it is solved as a whole.
+  /// Descent steps with the current cases of the law before the law is solved as a whole.
   int most_descents = 8;
   /// Halvings of a step with the current cases: solving the law is better than a short step.
   int few_halvings = 6;
@@ -275,7 +277,7 @@ struct Nodal {
   int halvings = 20;
   /// Ratio to the longest step below which steps at an indefinite Hessian lead to a saddle.
   double shrunk = 1e-2;
-  /// Share of the mean edge that the first trial away from a saddle moves a vertex by.
+  /// Displacement of the first trial away from a saddle, as a share of the mean edge.
   double first_move = 0.25;
   /// First share of the projection in the blend of an indefinite Hessian: see Directions.
   double least_blend = 0.1;

@@ -17,26 +17,26 @@ namespace diffcloth::solver {
 using linalg::dot;
 
 struct Options {
-  double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
-  int max_iterations;  ///< of a step, over all its solves
-  double max_seconds = std::numeric_limits<double>::infinity();  ///< of a step [s]
-  /// Whether every solve ends with a factor of the Hessian at its end. Otherwise a Newton or chord step below
-  /// the tolerance ends it, too.
+  double tolerance;    ///< bound on |p|_inf / h, p the full Newton step [m/s]
+  int max_iterations;  ///< limit for a step, over all its solves
+  double max_seconds = std::numeric_limits<double>::infinity();  ///< limit for a step [s]
+  /// If true, every solve ends with a factor of the Hessian at its end. Otherwise a Newton or chord step
+  /// below the tolerance may end it as well.
   bool certify = true;
-  /// A factor of more than this is dropped before the next one is made [bytes].
+  /// Size above which a factor is dropped before the next one is computed [bytes].
   std::size_t large_factor = std::size_t{64} << 20;
-  /// A factor of more operations per entry, of a sheet of 150 x 150 vertices or more, is dear beside the
-  /// solves with it, which are bounded by memory.
+  /// Operations per entry above which a factor is expensive compared with a solve, which is bounded by
+  /// memory: a sheet of 150 x 150 vertices or more.
   double dear_factor = 800.0;
 };
 
-/// What a step has seen of factorizations in single precision that fail.
+/// Outcomes of failed factorizations in single precision during a step.
 struct SinglePrecision {
-  bool was_right = false;  ///< doubles have found a matrix indefinite, too
-  bool was_wrong = false;  ///< doubles have factored one
+  bool was_right = false;  ///< doubles found a matrix indefinite as well
+  bool was_wrong = false;  ///< doubles factored a matrix that single precision could not
 };
 
-/// What the solves of one step share.
+/// State shared by the solves of one step.
 struct Context {
   Checkpoint* checkpoint;
   Options options;
@@ -44,15 +44,15 @@ struct Context {
   Stopwatch* watch;
   Counts* counts;
   SinglePrecision single = {};
-  int iterations = 0;                                ///< taken by all solves so far
-  std::vector<std::vector<double>>* path = nullptr;  ///< accepted iterates, where wanted
+  int iterations = 0;                                ///< total of all solves so far
+  std::vector<std::vector<double>>* path = nullptr;  ///< accepted iterates; null: not recorded
 };
 
-/// A walk from one feasible point to the next: the positions, the gradient there, and which motions
-/// from there are free of collisions. Every segment walked is certified.
+/// A polyline of feasible iterates: the current iterate, its gradient, and the motions from it that are
+/// free of collisions. Every segment is certified.
 class Walk {
  public:
-  /// @param x  in: a feasible start; moves along
+  /// @param x  in: a feasible start; out: the current iterate
   Walk(const Objective& f, std::vector<double>& x, Context& context)
       : f(f),
         context(context),
@@ -68,35 +68,35 @@ class Walk {
   const std::vector<double>& x() const { return x_; }
   const std::vector<double>& g() const { return g_; }
 
-  /// Find contacts and gradient where the walk stands, among the watched pairs.
+  /// Compute contacts, among the watched pairs, and the gradient at the current iterate.
   void refresh() {
     const Stopwatch::Scope scope(*context.watch, Phase::kAssembly);
     f.stand_at(x_.data());
     f.gradient(x_.data(), g_);
   }
 
-  /// Size of a change of all points [m].
+  /// Displacement of a change of all points [m].
   double displacement(const std::vector<double>& p) const { return f.coordinates->displacement(p); }
 
-  /// Watch the straight motion to a point, at least as far as it is free of collisions; returns the fraction
-  /// that is.
+  /// Detect collisions on the straight motion to a point. Contact then watches at least the part free of
+  /// collisions, whose fraction is returned.
   double watch(const std::vector<double>& to) {
     if (f.contact == nullptr) return 1.0;
     const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
     return f.contact->watch_free(x_.data(), to.data());
   }
 
-  /// The surfaces that may meet something on the straight motion to a point.
+  /// Flags of the surfaces that may meet something on the straight motion to a point.
   std::vector<char> meeting(const std::vector<double>& to) {
     const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
     return f.contact->meeting(x_.data(), to.data());
   }
 
-  /// Go along a change of all points, by the fraction alpha or less, as far as the straight motion of
-  /// every point to where it ends is free of collisions; what is watched is that motion.
+  /// Find the fraction, at most alpha, of a change of all points for which the straight motion of every
+  /// point to its end is free of collisions; contact watches this motion.
   ///
   /// @param to  out: the end
-  /// @return the fraction, 0 where there is no way
+  /// @return the fraction, 0 if there is none
   double watch(const std::vector<double>& p, double alpha, std::vector<double>& to) {
     f.coordinates->retract(x_, p, alpha, to);
     double safe = watch(to);
@@ -117,27 +117,27 @@ class Walk {
     return alpha;
   }
 
-  /// Change of the objective on the way to a point of the watched motion.
+  /// Change of the objective from the current iterate to a point of the watched motion.
   double change(const std::vector<double>& to) const {
     const Stopwatch::Scope scope(*context.watch, Phase::kLineSearch);
     return f.energy_change(x_.data(), to.data());
   }
 
-  /// Go to a point of the watched motion; the gradient there is still to be refreshed.
+  /// Move to a point of the watched motion; the gradient there must still be refreshed.
   void go(const std::vector<double>& to) {
     x_ = to;
     record();
     forget_energy();
   }
 
-  /// The same where the change of the objective is known.
+  /// Likewise, with a known change of the objective.
   void go(const std::vector<double>& to, double change) {
     const double before = extent_;
     go(to);
     extent_ = before + std::abs(change);
   }
 
-  /// The objective where the walk stands.
+  /// The objective at the current iterate.
   double energy() {
     if (!energy_) {
       energy_ = f.energy(x_.data());
@@ -146,20 +146,20 @@ class Walk {
     return *energy_;
   }
 
-  /// The size of the objective when it was last asked for, and of all that it has changed by since: without
-  /// the work of friction, which energies leave out. Infinity where that is not known.
+  /// Size of the objective at its last evaluation, plus all changes since, without the work of friction,
+  /// which energies leave out. Infinity if unknown.
   double extent() const { return extent_; }
 
-  /// Where the walk stands, to come back to.
+  /// An iterate to which the walk may return.
   struct Place {
     std::vector<double> x;
-    std::size_t steps;  ///< on the recorded path
+    std::size_t steps;  ///< length of the recorded path
   };
   Place place() const {
     return {.x = x_, .steps = context.path == nullptr ? 0 : context.path->size()};
   }
 
-  /// Be back at a place, as if nothing had been walked since.
+  /// Restore an iterate; all later steps are undone.
   void back(const Place& place) {
     x_ = place.x;
     forget_energy();
@@ -168,14 +168,14 @@ class Walk {
     refresh();
   }
 
-  /// Go to a point of the watched motion, with stresses extrapolated from here.
+  /// Move to a point of the watched motion, with stresses extrapolated from the current iterate.
   void go_extrapolating(const std::vector<double>& to) {
     f.for_each([&](Potential& p) { p.extrapolate(x_.data(), to.data()); });
     go(to);
     refresh();
   }
 
-  /// Go to a point of the watched motion unless the slope along p there is above a bound.
+  /// Move to a point of the watched motion unless the slope along p there exceeds a bound.
   bool go_if_flat(const std::vector<double>& to, const std::vector<double>& p, double bound) {
     std::vector<double> x_before = to;
     x_before.swap(x_);
@@ -192,7 +192,7 @@ class Walk {
     return false;
   }
 
-  /// Take one iteration from the budget of the step. False when it is used up, or the time.
+  /// Consume one iteration of the step's budget. False if iterations or time are used up.
   bool spend() {
     context.checkpoint->check();
     if (context.checkpoint->is_up()) return false;

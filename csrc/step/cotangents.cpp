@@ -8,7 +8,7 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Like add_to(), of an input that has one value for all pairs of surfaces, or one for each.
+/// Like add_to(), for an input with one value for all pairs of surfaces, or one for each pair.
 void add_pairs_to(double* out, const View& input, const Array& bar) {
   if (out == nullptr) return;
   for (std::size_t k = 0; k < bar.size(); ++k) out[input.count == 1 ? 0 : k] += bar[k];

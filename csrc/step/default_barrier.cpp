@@ -19,9 +19,10 @@ HalfGap at_half_gap(double xi, double barrier_distance) {
   return {.slope = -2.0 * d * b.b1, .stiffness = 4.0 * d * d * b.b2 + 2.0 * b.b1};
 }
 
-/// Remove springs with a length at rest from the weights; return the traces that they would add to the Hessian
-/// of each vertex without that length. Their Hessian depends on where their ends are, which the rest
-/// positions of several cloths do not say; shorter than at rest it is not even positive.
+/// Remove springs with a rest length from the weights; return the traces that they would add to the
+/// Hessian of each vertex with a rest length of zero. Their Hessian depends on the positions of their
+/// ends, which the rest positions of several cloths do not determine; for springs shorter than at rest
+/// it is not even positive definite.
 std::vector<double> take_out_long_springs(const Scene& scene,
                                           const Inputs& inputs,
                                           std::vector<double>& weights) {
@@ -58,7 +59,7 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
   if (!weights.empty())
     at_rest.views[static_cast<std::size_t>(Input::kSpringWeights)].data = weights.data();
   Problem p(scene, at_rest);
-  std::vector<double> x = p.start;  // bodies, too
+  std::vector<double> x = p.start;  // bodies included
   std::copy_n(scene.given.rest_positions.data(), p.cloth_size, x.begin());
   const linalg::BlockMatrix hessian = contact_free_hessian(p, x.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
@@ -90,11 +91,11 @@ std::size_t tree_of(const Scene& scene, Index surface) {
       given.links[given.surface_link[surface - scene.cloth_count()]].tree);
 }
 
-/// Mass that a contact with a tree feels [kg]: all of a free root's; of joints the most that one of
-/// them, with its drive, has at the farthest point that it moves. Zero where nothing is dynamic.
+/// Mass that a contact with a tree feels [kg]: the whole mass of a free root; for joints, the largest
+/// mass of a joint and its drive at the farthest point that the joint moves. Zero if nothing is dynamic.
 ///
 /// @param metric  the tree's block of A, [n_t^2]
-/// @param first   the tree's first coordinate; it has `count` of them
+/// @param first   first of the tree's `count` coordinates
 double felt_mass(const Scene& scene, const double* metric, Index first, Index count) {
   const bodies::MechanismsDescription& given = scene.mechanisms.given();
   const double h = scene.given.dt;
@@ -109,8 +110,8 @@ double felt_mass(const Scene& scene, const double* metric, Index first, Index co
   return result;
 }
 
-/// kappa at which each tree, resting on one of six sides, stays d_hat / 2 away; zero for trees that no force
-/// moves. Without gravity, where it crosses the gap from rest in a time step.
+/// kappa at which each tree, resting on one of six sides, stays d_hat / 2 away; without gravity, at
+/// which it crosses the gap from rest in a time step. Zero for trees that no force moves.
 std::vector<double> stiffness_of_trees(const Scene& scene,
                                        const Inputs& inputs,
                                        double barrier_distance) {
@@ -143,8 +144,8 @@ std::vector<double> stiffness_of_trees(const Scene& scene,
   return result;
 }
 
-/// At half the gap the barrier is softer, in numbers, the larger xi is: the factor that compensates it if one
-/// surface that kappa was chosen for, or the other one, is round.
+/// Factor on kappa for round surfaces: at half the gap the barrier is softer the larger xi is.
+/// Compensates the radius of the surface for which kappa was chosen, or of the other one.
 double for_radii(const Scene& scene, Index own, double xi, double radii, double barrier_distance) {
   if (radii == 0.0) return 1.0;
   const HalfGap without = at_half_gap(xi, barrier_distance);
@@ -159,7 +160,7 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
                                               const Inputs& inputs,
                                               double barrier_distance) {
   const Index surfaces = scene.surface_count();
-  // Stiffness that cloths and free bodies need, and joints, which count only without either.
+  // Stiffness required by cloths and free bodies; the requirement of joints counts only without either.
   std::vector<double> own = stiffness_of_cloths(scene, inputs, barrier_distance);
   std::vector<double> of_joints(own.size(), 0.0);
   const std::vector<double> of_trees = stiffness_of_trees(scene, inputs, barrier_distance);
@@ -185,7 +186,8 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
       result.push_back(kappa);
     }
   }
-  // Pairs that never touch have no stiffness of their own: any positive number serves, also if nothing touches.
+  // Pairs that never touch need no stiffness of their own: any positive number serves, also if nothing
+  // touches.
   const auto first = std::ranges::find_if(result, [](double kappa) { return kappa > 0.0; });
   std::ranges::replace(result, 0.0, first != result.end() ? double{*first} : 1.0);
   return result;

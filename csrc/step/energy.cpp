@@ -22,7 +22,7 @@ contact::Near near_at_start(const Problem& p, const contact::ContactModel& barri
   return near;
 }
 
-/// @throws std::domain_error where surfaces overlap
+/// @throws std::domain_error if surfaces overlap
 std::vector<contact::Contact> contacts_at_start(const Problem& p,
                                                 const contact::ContactModel& barrier) {
   const contact::Near near = near_at_start(p, barrier);
@@ -88,7 +88,7 @@ void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const 
 
 namespace {
 
-/// Gradients that have their numbers.
+/// Gradients with their own storage.
 struct OwnGradients {
   std::array<std::vector<double>, kInputCount> numbers;
 
@@ -121,7 +121,7 @@ struct OwnGradients {
 
 }  // namespace
 
-// Few numbers that depend on many: their gradients, each along all directions.
+// Few outputs depend on many inputs: compute their gradients, and multiply them by all directions.
 void push_forward_energy(const Scene& scene,
                          const Inputs& inputs,
                          std::span<const Direction> directions) {

@@ -18,7 +18,7 @@ enum class Input : std::uint8_t {
   kPositions,          ///< x_n [m]
   kVelocities,         ///< v_n [m/s]
   kBodyPoses,          ///< frames of the roots of all trees at the start of the step
-  kBodyTargets,        ///< at its end
+  kBodyTargets,        ///< these frames at the end of the step
   kPinTargets,         ///< [m]
   kSoftPinTargets,     ///< [m]
   kForces,             ///< [N]
@@ -28,9 +28,9 @@ enum class Input : std::uint8_t {
   kPoisson,            ///< nu [-]
   kDensity,            ///< rho [kg/m^2]
   kDamping,            ///< k_d [s]
-  kStretchWeft,        ///< k_f [N/m]; with it k_wf, and k_s is k_w
+  kStretchWeft,        ///< k_f [N/m]; given with k_wf, and k_s is then k_w
   kStretchShear,       ///< k_wf [N/m]
-  kBendingWeft,        ///< D_f [N m]; with it D_t, and D is D_w
+  kBendingWeft,        ///< D_f [N m]; given with D_t, and D is then D_w
   kBendingTwill,       ///< D_t [N m]
   kFriction,           ///< mu [-]
   kThickness,          ///< [m]
@@ -46,16 +46,16 @@ enum class Input : std::uint8_t {
   kTangentialDrag,     ///< C_t [-]
   kAirDensity,         ///< rho [kg/m^3]
   kWind,               ///< w [m/s]
-  kCoordinates,        ///< of mechanisms, at the start of the step
-  kCoordinateEnds,     ///< at its end, where prescribed
+  kCoordinates,        ///< coordinates of mechanisms at the start of the step
+  kCoordinateEnds,     ///< coordinates at the end of the step, where prescribed
   kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
   kCoordinateMetric,   ///< A
   kJointTerms,         ///< rows of bodies::JointTerm; absent: no coordinate has one
   kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
 
-/// Extent of an input: the things that each have a value. N vertices, F faces and C cloths; T trees and n coordinates of
-/// mechanisms; S surfaces.
+/// Extent of an input: the entities that have one value each. N vertices, F faces and C cloths; T trees
+/// and n coordinates of mechanisms; S surfaces.
 enum class Extent : std::uint8_t {
   kOne,          ///< []
   kVector,       ///< [3]
@@ -75,10 +75,10 @@ enum class Extent : std::uint8_t {
   kBlocks,       ///< [sum n_t^2], tree after tree
 };
 
-/// Where a step needs an input; elsewhere it may be absent.
+/// Condition under which a step needs an input; otherwise the input may be absent.
 enum class Need : std::uint8_t {
   kExtent,           ///< where the scene has anything of its extent
-  kNowhere,          ///< it has a default
+  kNowhere,          ///< nowhere: the input has a default
   kCloths,           ///< where there are cloths
   kBarrier,          ///< where there is a barrier
   kSoftPins,         ///< where there are soft pins

@@ -28,7 +28,7 @@ contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
   return p;
 }
 
-/// Rest shape of the rest_positions input; empty if absent, as the scene's own holds then.
+/// Rest shape of the rest_positions input; empty if absent: the scene's rest shape then holds.
 mesh::RestShape own_rest_shape(const Scene& scene, const Inputs& in) {
   const double* X = in.data(Input::kRestPositions);
   return X == nullptr ? mesh::RestShape() : mesh::rest_shape(scene.topology, scene.stencils, X);

@@ -19,10 +19,10 @@ namespace diffcloth::step {
 
 /// One environment's step, prepared: the potentials that its scheme minimizes, from its inputs.
 ///
-/// Forward and backward build the same one, so that both see the same bits.
+/// Forward and backward build equal problems, so that both see the same bits.
 class Problem {
  public:
-  /// @param wanted  whose cotangents are wanted; null: nobody's
+  /// @param wanted  requested gradients; null: none
   Problem(const Scene& scene, const Inputs& inputs, const Gradients* wanted = nullptr);
   Problem(const Problem&) = delete;
   Problem& operator=(const Problem&) = delete;
@@ -37,7 +37,7 @@ class Problem {
   mesh::RestShape own_rest_;
 
  public:
-  const mesh::RestShape* rest;  ///< the scene's, or of the rest_positions input
+  const mesh::RestShape* rest;  ///< rest shape of the scene, or of the rest_positions input
   contact::RestMeasures measures;
   std::vector<double> density;  ///< [F]
   std::vector<double> masses;   ///< [N] lumped [kg]
@@ -48,15 +48,15 @@ class Problem {
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
   std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see make_potentials()
   std::optional<bodies::CoordinatePotential> chart;        ///< absent without free coordinates
-  std::optional<contact::ContactModel> contact;            ///< absent where nothing can touch
+  std::optional<contact::ContactModel> contact;            ///< absent if nothing can touch
 
-  /// Where friction counts motion from.
+  /// Origin of the displacements in friction.
   const std::vector<double>& moved_from() const { return origins.empty() ? start : origins; }
 
   /// All of `potentials`.
   std::vector<Potential*> cloth_potentials() const;
 
-  /// The potential of this kind among them.
+  /// The member of `potentials` of this type.
   template <class Kind>
   Kind& find() const {
     for (const auto& potential : potentials) {
@@ -70,14 +70,14 @@ class Problem {
                               std::vector<Potential*> others,
                               solver::PatternCache& patterns);
 
-  /// All points, with these rows and everything prescribed at its targets.
+  /// All points, with these rows, and prescribed points at their targets.
   std::vector<double> at(const double* rows) const;
 
-  /// All points where cloths go on as they move at the start, and everything prescribed is at its target.
+  /// All points, with cloths at x_n + h v_n, and prescribed points at their targets.
   std::vector<double> coasting() const;
 
-  /// All points, with these cloth positions, free coordinates at their targets t as far as their speed
-  /// is not limited, and everything prescribed at its own.
+  /// All points, with these cloth positions, free coordinates at their targets t as far as the limit on
+  /// their speed allows, and prescribed points at their targets.
   std::vector<double> predicted(const double* cloth_positions) const;
 };
 
@@ -87,13 +87,13 @@ linalg::BlockMatrix contact_free_hessian(Problem& problem, const double* x, Curv
 /// A parameter given as one value, one a cloth or one a face, for each face.
 std::vector<double> values_per_face(const Problem& problem, Input input);
 
-/// Adjoint of values_per_face(): the gradient of the input, if wanted, gets the sums, in order.
+/// Adjoint of values_per_face(): adds the sums, in order, to the gradient of the input, if wanted.
 void add_per_face(const Problem& problem,
                   Input input,
                   const std::vector<double>& bar,
                   const Gradients& gradients);
 
-/// Quantity per area of faces, lumped at vertices: a third of each face goes to each corner [N].
+/// Quantity per area of faces, lumped at vertices: each corner gets a third of its face [N].
 std::vector<double> lumped(const Problem& problem, const std::vector<double>& per_face);
 
 }  // namespace diffcloth::step

@@ -13,7 +13,7 @@
 
 namespace diffcloth::step {
 
-/// Outcome of an environment's step, as the report states it.
+/// Outcome of an environment's step in the report.
 enum class Result : std::int32_t {
   kConverged = 0,
   kNotConverged = 1,
@@ -21,35 +21,35 @@ enum class Result : std::int32_t {
   kIntersectingStart = 3,
 };
 
-/// Contacts of two surfaces, of which the first has the smaller index.
+/// Contacts of two surfaces; the first has the smaller index.
 struct PairContacts {
   Index first = 0;
   Index second = 0;
   Index count = 0;
-  Vec3 force = Vec3::Zero();  ///< of the first on the second, barrier and friction [N]
+  Vec3 force = Vec3::Zero();  ///< force of the first on the second, barrier and friction [N]
 };
 
-/// A contact between two surfaces, of which the first has the smaller index.
+/// A contact between two surfaces; the first has the smaller index.
 struct ContactPoint {
   Index first = 0;
   Index second = 0;
-  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest, on each of them [m]
-  Vec3 normal = Vec3::Zero();                              ///< from the first to the second
-  double gap = 0.0;                      ///< between the surfaces, their thickness taken off [m]
-  double normal_force = 0.0;             ///< of the first on the second, along the normal [N]
-  Vec3 tangential_force = Vec3::Zero();  ///< likewise, of friction [N]
+  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest point on each surface [m]
+  Vec3 normal = Vec3::Zero();            ///< direction from the first to the second
+  double gap = 0.0;                      ///< distance of the surfaces, without their thickness [m]
+  double normal_force = 0.0;             ///< force of the first on the second along the normal [N]
+  Vec3 tangential_force = Vec3::Zero();  ///< friction of the first on the second [N]
 };
 
 struct Report {
   Result result = Result::kConverged;
-  solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< that ended the deciding solve
-  bool certified = true;  ///< every solve has ended with a factor of its Hessian
+  solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< end of the deciding solve
+  bool certified = true;  ///< every solve ended with a factor of its Hessian
   Index iterations = 0;
   double residual = 0.0;          ///< |p|_inf / h [m/s]
-  double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
+  double minimum_distance = 0.0;  ///< smallest in contact; infinite without contact [m]
   Index contact_count = 0;
   double motion_fraction = 1.0;
-  std::vector<double> root_poses;  ///< where the motion has ended before its end [T, 7]; else empty
+  std::vector<double> root_poses;  ///< poses at the end of an incomplete motion [T, 7]; else empty
   Index taking_off = 0;            ///< nodes in dry frictional contact, by the cases of its law
   Index sticking = 0;
   Index slipping = 0;
@@ -57,10 +57,10 @@ struct Report {
   Seconds seconds{};
   double cpu_seconds = 0.0;  ///< processor time of the threads of the environment [s]
   std::string message;
-  std::vector<PairContacts> pairs;   ///< in ascending order
-  std::vector<ContactPoint> points;  ///< of barrier and friction, not of nodes
+  std::vector<PairContacts> pairs;   ///< pairs in ascending order
+  std::vector<ContactPoint> points;  ///< contacts with barrier and friction, not nodes
 
-  /// Call visit(name, value) for every number but the seconds.
+  /// Call visit(name, value) for every number except times.
   template <class Visit>
   void for_each(Visit&& visit) const {
     visit("status", static_cast<std::int64_t>(result));
@@ -87,7 +87,8 @@ struct Report {
   }
 };
 
-/// Contacts of each pair of surfaces and the force of the first on the second, added up in a report.
+/// Accumulates in a report the contacts of each pair of surfaces and the force of the first on the
+/// second.
 class PairTally {
  public:
   explicit PairTally(Report& report) : pairs_(report.pairs) {}
@@ -95,7 +96,7 @@ class PairTally {
   /// Count the contacts of a solution, and add the forces of barrier and friction there.
   ///
   /// @param contacts  at the solution
-  /// @param friction  of the contacts that it was taken from; null where there are none
+  /// @param friction  lagged friction of the solution; null if there is none
   void add(const contact::ContactModel& model,
            const std::vector<contact::Contact>& contacts,
            const contact::FrictionSet* friction,

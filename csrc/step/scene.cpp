@@ -48,7 +48,7 @@ contact::CollisionMesh make_collision_mesh(const Description& d,
           std::move(radius)};
 }
 
-/// All surfaces as given: the reference that the collision trees are built from.
+/// All surfaces as given: the reference for the collision trees.
 std::vector<double> reference_positions(const Description& d) {
   std::vector<double> x = d.vertices;
   x.insert(x.end(), d.bodies.vertices.begin(), d.bodies.vertices.end());
@@ -97,7 +97,7 @@ double mean_length(const mesh::RestShape& rest,
   for (const auto& [i, j] : mesh.edges) {
     sum += (row(bodies.vertices.data(), j) - row(bodies.vertices.data(), i)).norm();
   }
-  // A round body counts with its radius.
+  // Round bodies include their radius.
   std::size_t count = mesh.edges.size();
   for (const double radius : mesh.radius) {
     sum += radius;
@@ -106,7 +106,7 @@ double mean_length(const mesh::RestShape& rest,
   return sum / static_cast<double>(count);
 }
 
-/// The mechanisms as given; without any, each body is a tree of one link without coordinates.
+/// The mechanisms as given; by default, each body is a tree of one link without coordinates.
 bodies::MechanismsDescription complete(const Description& d) {
   bodies::MechanismsDescription m = d.mechanisms;
   if (!m.tree_free.empty()) return m;
@@ -126,7 +126,7 @@ bodies::MechanismsDescription complete(const Description& d) {
   return m;
 }
 
-/// Which pose places a surface: the one of its tree, unless that is a mechanism.
+/// Index of the pose that places a surface: of its tree, unless the tree has coordinates.
 std::vector<Index> surface_poses(const bodies::Mechanisms& mechanisms) {
   std::vector<Index> pose;
   const bodies::MechanismsDescription& given = mechanisms.given();
@@ -152,7 +152,7 @@ std::vector<char> make_prescribed(const Description& d, const bodies::Mechanisms
   return prescribed;
 }
 
-/// Face searches of the bodies that nodes touch.
+/// Face searches of the bodies in contact with nodes.
 std::vector<projective::FaceSearch> face_searches(const Description& d) {
   std::vector<projective::FaceSearch> searches(d.primitives.size());
   for (std::size_t k = 0; k < d.primitives.size(); ++k) {
@@ -188,7 +188,7 @@ projective::VertexSpheres make_vertex_spheres(const Description& d,
   return spheres;
 }
 
-/// Prescribed rows: the cloth's vertices and the nodes of coordinates.
+/// Flags of prescribed rows: the cloth's vertices and the nodes of coordinates.
 std::vector<char> fixed_rows(const std::vector<char>& prescribed,
                              Index cloth_vertex_count,
                              const bodies::Mechanisms& mechanisms) {
@@ -198,7 +198,7 @@ std::vector<char> fixed_rows(const std::vector<char>& prescribed,
   return fixed;
 }
 
-/// Cliques of elements, and of the cloths' vertices that one spring is attached to.
+/// Cliques of elements, and of the cloths' vertices that share a spring.
 std::vector<std::vector<Index>> cloth_cliques(const Description& d,
                                               const mesh::Topology& topology,
                                               const mesh::BendingStencils& stencils) {
@@ -214,7 +214,7 @@ std::vector<std::vector<Index>> cloth_cliques(const Description& d,
   return cliques;
 }
 
-/// A pattern of the cloths with the nodes of coordinates behind it.
+/// A pattern of the cloths, followed by the nodes of coordinates.
 linalg::BlockPattern with_nodes(Index cloth_vertex_count,
                                 std::vector<std::vector<Index>> cliques,
                                 const bodies::Mechanisms& mechanisms) {
@@ -225,7 +225,7 @@ linalg::BlockPattern with_nodes(Index cloth_vertex_count,
   return {cloth_vertex_count + mechanisms.node_count(), cliques};
 }
 
-/// Free bodies that no spring holds: without contact, inertia and the given forces alone move them.
+/// Free bodies without springs: without contact, only inertia and the given forces move them.
 std::vector<bodies::Mechanisms::FreeBody> find_free_bodies(const Description& d,
                                                            const bodies::Mechanisms& mechanisms,
                                                            const contact::CollisionMesh& mesh) {

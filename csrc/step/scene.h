@@ -23,7 +23,7 @@
 
 namespace diffcloth::step {
 
-/// The ways to take a step.
+/// Schemes for a step.
 enum class SchemeKind : std::uint8_t { kCoupled, kSplit, kProjective };
 
 /// The integrators of `coupled`: see schemes/coupled.h and schemes/second_order.h.
@@ -32,7 +32,7 @@ enum class Integrator : std::uint8_t { kImplicitEuler, kSecondOrder };
 /// Metric of the contact stage of `split`.
 enum class Metric : std::uint8_t { kEnergy, kElastic, kMass, kIdentity };
 
-/// How the elastic stage of `split` and `projective` is solved.
+/// Solvers of the elastic stage of `split` and `projective`.
 enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
 
 /// A value that has a name in Python.
@@ -48,9 +48,9 @@ struct Named {
 struct SchemeRow {
   const char* name;
   SchemeKind value;
-  bool has_barrier = true;         ///< else cloths touch bodies and each other at their nodes
+  bool has_barrier = true;         ///< if false, cloths touch bodies and each other at their nodes
   bool moves_bodies = false;       ///< cloths and dynamic bodies are solved together
-  bool has_elastic_stage = false;  ///< elasticity is solved alone first, by one of kElasticSolvers
+  bool has_elastic_stage = false;  ///< elasticity is first solved alone, by one of kElasticSolvers
   bool has_metrics = false;        ///< nearness may be measured in each of kMetrics
 };
 
@@ -85,9 +85,9 @@ inline constexpr std::array kElasticSolvers{
 
 /// Springs between points of cloths and bodies, or to targets: see elastic/springs.h.
 struct AttachmentDescription {
-  std::vector<Index> start{0};      ///< [A + 1] of the points of each
-  std::vector<Index> point;         ///< of cloths, then of bodies
-  std::vector<double> coefficient;  ///< of the points
+  std::vector<Index> start{0};      ///< [A + 1] first point of each
+  std::vector<Index> point;         ///< points of cloths, then of bodies
+  std::vector<double> coefficient;  ///< coefficients of the points
   std::vector<double> rest_length;  ///< [A] [m]
   std::vector<Index> target_row;    ///< [A] row among the targets, -1: none
   Index target_count = 0;
@@ -108,26 +108,26 @@ struct Description {
   bodies::BodySet bodies;
   bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
-  /// [surfaces of bodies] of round ones, 0 of others; empty: none [m]
+  /// [surfaces of bodies] radii of round bodies, 0 for others; empty: all 0 [m]
   std::vector<double> body_radii;
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
-  /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
-  /// empty: none
+  /// [surfaces of bodies] shapes of surfaces that cloths touch at their nodes, instead of by the
+  /// barrier; empty: none
   std::vector<projective::Primitive> primitives;
-  std::vector<std::string> surface_names;  ///< in messages; empty: surfaces have numbers
+  std::vector<std::string> surface_names;  ///< names in messages; empty: surfaces have numbers
   std::vector<std::string> pin_names;      ///< [P] group of each pin; empty: none
   bool self_contact = true;
   double dt = 0.01;
   SchemeKind scheme = SchemeKind::kCoupled;
-  Integrator integrator = Integrator::kImplicitEuler;  ///< kSecondOrder: of kCoupled alone
+  Integrator integrator = Integrator::kImplicitEuler;  ///< kSecondOrder: for kCoupled only
   Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
-  bool begins_at_state = false;  ///< solves begin where the step does, not where inertia leads
+  bool begins_at_state = false;  ///< solves begin at x_n, not at the inertial guess
   solver::Options options{};
 };
 
-/// Everything of a scene that no step changes. Immutable, but for caches that only remember.
+/// Everything in a scene that is constant over steps. Immutable, except for caches.
 struct Scene {
   explicit Scene(Description description);
 
@@ -137,7 +137,7 @@ struct Scene {
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
   Index point_count() const { return static_cast<Index>(prescribed.size()); }
 
-  /// Report whether a spring is attached to a body.
+  /// True if a spring is attached to a body.
   bool has_attached_bodies() const;
 
   const SchemeRow& scheme() const { return kSchemes[static_cast<std::size_t>(given.scheme)]; }
@@ -148,34 +148,34 @@ struct Scene {
   std::vector<Vec2> material_axes;  ///< [F] the warp in the rest frames; empty: no weft
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
-  mesh::RestShape rest;  ///< of given.rest_positions
+  mesh::RestShape rest;  ///< rest shape of given.rest_positions
   bodies::Mechanisms mechanisms;
   contact::CollisionMesh collision_mesh;
   std::vector<bodies::Mechanisms::FreeBody>
-      free_bodies;                          ///< that nothing is attached to; surfaces of the scene
-  double mean_edge;                         ///< of the cloths at rest, else of the bodies [m]
+      free_bodies;                          ///< bodies without springs; surfaces of the scene
+  double mean_edge;                         ///< mean edge of cloths at rest, else of bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
-  contact::RestMeasures measures;           ///< of given.rest_positions and the bodies
+  contact::RestMeasures measures;           ///< measures of given.rest_positions and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
-  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
-  projective::VertexSpheres vertex_spheres;         ///< where the scheme lets vertices touch
+  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] those that nodes touch
+  projective::VertexSpheres vertex_spheres;         ///< if the scheme allows vertices to touch
   elastic::Slots slots;
-  elastic::Elements held_elements;  ///< those with a pinned corner
+  elastic::Elements held_elements;  ///< elements with a pinned corner
 
   mutable elastic::PreparedCache prepared;                    ///< models of `rest`
-  mutable solver::PatternCache elastic_patterns;              ///< over the elastic pattern
-  mutable solver::PatternCache diagonal_patterns;             ///< over isolated vertices
-  mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern
+  mutable solver::PatternCache elastic_patterns;              ///< patterns over the elastic pattern
+  mutable solver::PatternCache diagonal_patterns;             ///< patterns over isolated vertices
+  mutable projective::ConstantMatrixCache constant_matrices;  ///< matrices over the elastic pattern
 };
 
-/// Rest quantities that weigh contacts, for a rest shape of the cloths.
+/// Rest quantities that weight contacts, for a rest shape of the cloths.
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
 
-/// Two primitives near each other, and how far they must be apart at least [m].
+/// Two primitives near each other, and their minimum distance [m].
 struct ClosePair {
   double distance;
-  double thickness;  ///< mean of their surfaces, and the radii of round ones
+  double thickness;  ///< mean of both surfaces, plus the radii of round bodies
   contact::Candidate pair;
 };
 
@@ -188,7 +188,7 @@ std::vector<contact::Candidate> find_near(const Scene& scene,
                                           double reach,
                                           contact::BroadPhase::Scratch& scratch);
 
-/// The candidate with the smallest gap, of those up to `reach`.
+/// The candidate with the smallest gap up to `reach`.
 std::optional<ClosePair> find_closest(const Scene& scene,
                                       const double* x,
                                       const std::vector<double>& thickness,
@@ -199,15 +199,15 @@ std::optional<ClosePair> find_closest(const Scene& scene,
 std::string describe_pair(const Scene& scene, const contact::Candidate& pair);
 
 /// "cloth 'shirt' (pins 'collar'), body 'table'": surfaces within `reach` beyond their thickness of
-/// another primitive, those that are prescribed as well, and the pins among their vertices.
+/// another primitive, including prescribed surfaces, and the pins among their vertices.
 std::string describe_near(const Scene& scene,
                           const double* x,
                           const std::vector<double>& thickness,
                           double reach);
 
-/// Where two surfaces overlap or are closer than their thickness; empty where they are not.
+/// Description of two surfaces that overlap or are closer than their thickness; empty if there are none.
 ///
-/// @param candidates  all pairs that are that close, at least
+/// @param candidates  at least all pairs that are that close
 std::string find_overlap(const Scene& scene,
                          const double* x,
                          const std::vector<double>& thickness,

@@ -14,28 +14,28 @@ namespace diffcloth::step {
 
 /// Arrays to which the stages of a step add the forces at its end [N].
 struct Forces {
-  double* bodies;   ///< of contact, on the bodies' vertices [V, 3]
-  double* contact;  ///< of contact, on the cloths' vertices [N, 3]
-  double* pins;     ///< that hold the pinned vertices where they are [P, 3]
+  double* bodies;   ///< contact forces on the bodies' vertices [V, 3]
+  double* contact;  ///< contact forces on the cloths' vertices [N, 3]
+  double* pins;     ///< forces that hold the pinned vertices [P, 3]
 };
 
-/// Forces that hold pins: the gradient of all that acts on them.
+/// Add the forces that hold pins: the gradient of the objective at them.
 void add_pin_forces(const Problem& problem,
                     const solver::Objective& objective,
                     const std::vector<double>& x,
                     double* pins);
 
-/// Context of a step that is to be taken.
+/// Context of a forward step.
 struct Forward {
   Problem& problem;
   contact::Detection& detection;
   solver::Context& context;
-  const Arrays<double>& tape;  ///< empty where no tape is wanted
-  solver::KeptSolves& kept;    ///< for backward
+  const Arrays<double>& tape;  ///< empty: no tape
+  solver::KeptSolves& kept;    ///< solves kept for backward
   Report& report;
 };
 
-/// A step that has been taken, to be differentiated.
+/// A completed step, to be differentiated.
 struct Taken {
   Problem& problem;
   contact::Detection& detection;
@@ -47,17 +47,17 @@ struct Taken {
 /// A reverse pass over several losses side by side.
 struct Backward : Taken {
   std::span<Cotangents> losses;
-  bool barrier;   ///< whether gradients of the barrier's inputs are requested
-  bool friction;  ///< likewise of friction, which depends on the barrier
+  bool barrier;   ///< true if gradients of the barrier's inputs are requested
+  bool friction;  ///< likewise for friction, which depends on the barrier
 };
 
 /// A forward pass of tangents along several directions of the inputs side by side.
 struct Pushforward : Taken {
   std::span<const Tangents> directions;
-  std::span<const Forces> forces;  ///< of each direction: the changes of the forces are added here
+  std::span<const Forces> forces;  ///< changes of the forces for each direction are added here
 };
 
-/// A way to take a step: its minimizations, their order, and their derivatives.
+/// A scheme for a step: its minimizations, their order, and their derivatives.
 class Scheme {
  public:
   Scheme() = default;
@@ -73,11 +73,11 @@ class Scheme {
   /// @param x  in: at the start of the step
   virtual void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const = 0;
 
-  /// Pull the cotangents of the end back to all quantities that the potentials depend on, for each loss as if
-  /// it were alone.
+  /// Pull the cotangents of the end back to all quantities on which the potentials depend, separately
+  /// for each loss.
   virtual void backward(const Backward& step) const = 0;
 
-  /// How all points at the end change along each direction, as if it were alone.
+  /// Changes of all points at the end along each direction, separately for each.
   virtual std::vector<std::vector<double>> tangent(const Pushforward& step) const = 0;
 };
 

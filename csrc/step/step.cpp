@@ -52,7 +52,7 @@ void read_outputs(const Problem& problem,
   bars.pin_forces.assign(pin_bar, pin_bar + 3 * scene.given.pins.size());
 }
 
-/// Change of the outputs but the forces, from the change of all points at the end.
+/// Change of the outputs except forces, from the change of all points at the end.
 void write_outputs(const Problem& problem,
                    const Tangents& tangents,
                    std::vector<double> x,
@@ -106,7 +106,7 @@ std::string find_overlap(const Scene& scene, const Inputs& inputs) {
 
 namespace {
 
-/// Options of the solves that derivatives begin with.
+/// Options of the solves for derivatives, which need a certificate.
 solver::Options certifying(solver::Options options) {
   options.certify = true;
   return options;
@@ -134,7 +134,7 @@ Report forward(const Scene& scene,
     const Stopwatch::Scope scope(watch, Phase::kDetection);
     const double* const x = problem.start.data();
     const std::vector<double>& reach = problem.contact->reach();
-    // One list for this, the contacts at the start, and the way to where inertia leads.
+    // One list for this search, the contacts at the start, and the path to the inertial guess.
     const std::vector<double> guess = problem.predicted(problem.inertia.target().data());
     detection.candidates.prepare(x, guess.data(), reach, detection.scratch);
     contact::Found found;
@@ -145,7 +145,7 @@ Report forward(const Scene& scene,
       report.result = Result::kIntersectingStart;
       return report;
     }
-    detection.scratch = {};  // the list answers from here on, mostly without a search of everything
+    detection.scratch = {};  // the list replaces most searches of all pairs from here on
   }
 
   linalg::CholeskyWorkspace workspace(threads);

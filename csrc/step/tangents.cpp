@@ -8,7 +8,7 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Change of the vertices of bodies and of the frames with the poses of all roots.
+/// Change of the vertices of bodies, and of the frames, due to the poses of all roots.
 void move_roots(const Problem& p, Input input, const double* change, Array& points) {
   if (change == nullptr) return;
   const double* const poses = p.inputs.data(input);
@@ -93,7 +93,7 @@ Array predicted(const Problem& p, const Tangents& tangents) {
 constexpr std::array kOfContact = {Input::kBarrierDistance, Input::kSlipVelocity, Input::kThickness,
                                    Input::kBarrierStiffness, Input::kFriction};
 
-/// Copy the tangent of an input that has one value for all pairs of surfaces, or one for each.
+/// Copy the tangent of an input with one value for all pairs of surfaces, or one for each pair.
 void copy_pairs(const Problem& p, const Inputs& directions, Input input, Array& out) {
   const double* const change = directions.data(input);
   if (change == nullptr) return;

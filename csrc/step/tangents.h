@@ -8,16 +8,16 @@
 namespace diffcloth::step {
 
 /// Tangents of the quantities that the potentials of a step share, along one direction of the inputs:
-/// Cotangents, transposed. Fields whose names there are the same mean the tangents of the same quantities.
+/// the transpose of Cotangents. Fields with equal names hold the tangents of the same quantities.
 class Tangents {
  public:
-  /// @param directions  a tangent for each input, of the count of that input; zero where null
+  /// @param directions  a tangent for each input, with the count of that input; zero where null
   Tangents(const Problem& problem, const Inputs& directions);
 
-  /// Put them into the potentials of the problem, for Potential::add_tangent(): all but contact.
+  /// Put the tangents into the potentials of the problem, for Potential::add_tangent(): all but contact.
   void push_forward(Problem& problem) const;
 
-  /// Where friction counts motion from, as Problem::moved_from().
+  /// Tangent of the origin of friction's displacements, as Problem::moved_from().
   const std::vector<double>& moved_from() const { return origins.empty() ? start : origins; }
 
   Inputs directions;
@@ -28,14 +28,14 @@ class Tangents {
   std::vector<double> masses;      ///< [N]
   std::vector<double> prediction;  ///< y, the target of inertia [3 N]
   contact::ContactModel::Bar contact;
-  bool changes_contact = false;  ///< whether that is not zero
+  bool changes_contact = false;  ///< true if `contact` is not zero
 
-  mesh::RestShapeBar rest;  ///< empty where the rest shape does not change
+  mesh::RestShapeBar rest;  ///< empty if the rest shape does not change
 
   /// Tangent of an input that is given per face [F].
   std::vector<double> per_face(const Problem& problem, Input input) const;
 
-  /// Tangent of lumped(): by an input per face, and by the areas.
+  /// Tangent of lumped(): of an input per face, and of the areas.
   ///
   /// @param values  of the input [F]
   std::vector<double> lumped(const Problem& problem,

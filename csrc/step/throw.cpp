@@ -15,16 +15,17 @@
 //
 //   (1 - a) f,   a = -w.F / w.f  within [0, 1],   w = A^-1 f,
 //
-// A the positive Hessian of all potentials but contact: loads may hold against the push, up to balance; what
-// they add to it is no energy of the barrier. All points of the pair move by s u, u = A^-1 (1 - a) f, so that
-// the distance of a contact is d + s d', of which the part d'_i is by one vertex or tree. With mu = u.(1 - a) f,
-// the load l = -u.(a f) and the barrier's energy
+// A the positive Hessian of all potentials but contact: loads may oppose the push, up to balance; any
+// load in the direction of the push is no energy of the barrier. All points of the pair move by s u, u =
+// A^-1 (1 - a) f, so that the distance of a contact is d + s d', with d'_i the part of d' from one
+// vertex or tree. With  mu = u.(1 - a) f,  the load  l = -u.(a f)  and the barrier's energy
 //
 //   E(s) = sum over its contacts of (d'_i / d') kappa w m b((d + s d')^2),
 //
-// its first step ends where  mu s^2 / 2 + E(s) - l s  is least. What is stored there, down to where push and
-// load balance, becomes kinetic energy at most. So the speed holds for implicit Euler, which dissipates most
-// of the energy where a step is longer than the barrier takes: 99 % at 10 ms with a default barrier stiffness.
+// its first step ends at the minimum of  mu s^2 / 2 + E(s) - l s.  The energy stored there, down to the
+// balance of push and load, becomes kinetic energy at most. The speed is that of implicit Euler, which
+// dissipates most of the energy if a step is longer than the barrier's time scale: 99 % at 10 ms with a
+// default barrier stiffness.
 
 namespace diffcloth::step {
 namespace {
@@ -32,9 +33,9 @@ namespace {
 using contact::Contact;
 using Array = std::vector<double>;
 
-constexpr int kHalvings = 50;  // of an interval, as far as float64 resolves it
+constexpr int kHalvings = 50;  // halvings of an interval, to the resolution of float64
 
-/// Where a condition that holds from some point on begins to hold.
+/// Smallest argument at which a monotone condition holds.
 template <class Condition>
 double first_point(double low, double high, Condition&& holds) {
   for (int i = 0; i < kHalvings; ++i) {
@@ -44,7 +45,8 @@ double first_point(double low, double high, Condition&& holds) {
   return high;
 }
 
-/// Owners: bodies that move as one, by rows of the unknowns and by vertices: vertices of cloths, then trees.
+/// Owners: bodies that move as a whole, by rows of the unknowns and by vertices: first the vertices of
+/// cloths, then trees.
 class Owners {
  public:
   explicit Owners(const Scene& scene)
@@ -66,7 +68,7 @@ class Owners {
   Index of_row(Index row) const { return of_row_[row]; }
   Index of_vertex(Index vertex) const { return of_vertex_[vertex]; }
 
-  /// a.b over the rows of each.
+  /// a.b over the rows of each owner.
   std::map<Index, double> products(const Array& a, const Array& b) const {
     std::map<Index, double> result;
     for (Index i = 0; i < row_count(); ++i) {
@@ -82,11 +84,11 @@ class Owners {
   std::vector<Index> of_vertex_;
 };
 
-/// The contacts of one owner, as their distances change at the rates that they have at the start.
+/// The contacts of one owner, with distances that change at their initial rates.
 class Course {
  public:
   /// @param rate  of the distance
-  /// @param own   the part of it that is by this course
+  /// @param own   the part of the rate from this owner
   void add(const Contact& c, double rate, double own, double d_hat) {
     const double d = std::sqrt(c.closest.d_sq);
     terms_.push_back({.stiffness = c.kappa * c.weight * c.mollifier,
@@ -98,9 +100,9 @@ class Course {
     if (rate > 0.0) end_ = std::max(end_, (d_hat + c.xi - d) / rate);
   }
 
-  /// ds/dt that the barrier gives in steps of h.
+  /// ds/dt after the barrier has acted, in steps of h.
   double final_rate(double mu, double load, double h) const {
-    // A push that did not fall on the way would end at 1.
+    // A push that did not decrease along the path would end at 1.
     const double first = first_point(0.0, 1.0, [&](double s) { return mu * s + slope(s) > load; });
     const double last =
         first_point(first, std::max(first, end_), [&](double s) { return slope(s) > load; });
@@ -142,7 +144,7 @@ class Course {
   }
 
   std::vector<Term> terms_;
-  double end_ = 0.0;  // where all that come apart are out of reach
+  double end_ = 0.0;  // value of s at which all separating contacts are out of reach
 };
 
 /// The courses of the owners that the contacts of two surfaces move along a change of all points.
@@ -211,7 +213,7 @@ std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs) {
   std::optional<Throw> fastest;
   contact::for_each_pair(
       model, barrier.contacts(), [&](const auto&, const std::vector<Contact>& own) {
-        // Forces with the signs of gradients, as solve() takes them: it returns the motion.
+        // Forces with the signs of gradients, as in solve(), which returns the motion.
         Array push;
         Array dx;
         Array motion;

@@ -20,4 +20,4 @@ ANIMATIONS: Mapping[str, Callable[[Path, Animation], None]] = {
     ".usda": write_usd,
     ".usdc": write_usd,
 }
-"""Ending -> its writer."""
+"""Ending -> writer."""

@@ -1,8 +1,8 @@
 """glTF 2.0: cloths as morph targets, one for each state; bodies and links as moving nodes.
 
 A morph target holds the displacements from the first state. At the time of state k its weight is
-one and all others are zero; between two times players interpolate linearly. glTF is y up: a root
-node turns the scene, and everything below it has our axes. Numbers are float32.
+one and all others are zero; players interpolate linearly between two times. glTF is y up: a root
+node turns the scene, and all nodes below it have our axes. Numbers are float32.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def _mesh(buffer: _Buffer, surface: MovingSurface) -> tuple[Json, int]:
 
 
 def _quaternions(poses: FloatArray) -> FloatArray:
-    """Quaternions (x, y, z, w) of poses [T, 7]; neighbors in time have no opposite signs."""
+    """Quaternions (x, y, z, w) of poses [T, 7]; successive ones never have opposite signs."""
     turns = np.roll(poses[:, 3:], -1, axis=1)
     opposite = (turns[1:] * turns[:-1]).sum(axis=1) < 0.0
     turns[1:] *= np.where(np.cumsum(opposite) % 2, -1.0, 1.0)[:, None]

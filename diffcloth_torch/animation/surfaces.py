@@ -23,7 +23,7 @@ class MovingSurface:
         faces: Vertex indices, shape [f, 3].
         vertices: In the world [m], shape [T, v, 3]; or, with `frames`, in the frame of the surface,
             shape [v, 3].
-        frames: Frames of a rigid surface, shape [T, 4, 4]; None of a cloth.
+        frames: Frames of a rigid surface, shape [T, 4, 4]; None for a cloth.
         vectors: Name -> vectors at the vertices in SI units, shape [T, v, 3].
     """
 
@@ -65,7 +65,7 @@ class Animation:
         """Require times that increase, as formats with a time axis do.
 
         Raises:
-            InvalidInput: If a time is not after the one before it.
+            InvalidInput: If a time is not larger than the previous one.
         """
         late = np.flatnonzero(~(np.diff(self.times) > 0.0))
         if late.size:

@@ -69,7 +69,7 @@ def _add(stage: Any, geometry: Any, surface: MovingSurface, codes: list[float]) 
         placement = mesh.AddTransformOp()
         frames = surface.frames[:1] if surface.is_still else surface.frames
         for code, frame in zip(codes, frames, strict=False):
-            matrix = matrices.Matrix4d(*frame.T.reshape(-1).tolist())  # it multiplies rows
+            matrix = matrices.Matrix4d(*frame.T.reshape(-1).tolist())  # Matrix4d multiplies rows
             placement.Set(matrix) if surface.is_still else placement.Set(matrix, code)
         return
     speeds = mesh.CreateVelocitiesAttr() if "velocity" in surface.vectors else None
@@ -85,7 +85,7 @@ def _bounds(vertices: Any) -> Any:
 
 
 def _free_path(stage: Any, name: str) -> str:
-    """Path of a new prim: names become identifiers, and a number tells equal ones apart."""
+    """Path of a new prim: names become identifiers, and a number distinguishes equal ones."""
     tools = from_extra("pxr.Tf", "usd", "USD files need usd-core")
     path = "/scene/" + "/".join(tools.MakeValidIdentifier(part) for part in name.split("/"))
     free, number = path, 1

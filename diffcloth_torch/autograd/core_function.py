@@ -25,13 +25,13 @@ Arrays = dict[str, NDArray[np.float64]]
 
 
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
-    """Contiguous array of a tensor's numbers; shares its memory if possible."""
+    """Return a contiguous array of a tensor's numbers; shares its memory if possible."""
     return np.ascontiguousarray(numbers_of(tensor))
 
 
 @contextmanager
 def failing_as(operation: str) -> Iterator[None]:
-    """Let failures of the core name the operation."""
+    """Add the name of the operation to errors of the core."""
     try:
         yield
     except _core.SimulationError as error:
@@ -42,9 +42,9 @@ class CoreFunction(ABC):
     """A function of the core that is evaluated once, by `evaluate`.
 
     Attributes:
-        owner: What messages say that it is.
-        names: Of its differentiable inputs.
-        tape: What its derivatives need beside these; the graph keeps it.
+        owner: Name of the function in messages.
+        names: Names of its differentiable inputs.
+        tape: Further data for its derivatives, kept by the graph.
     """
 
     owner: str
@@ -55,21 +55,21 @@ class CoreFunction(ABC):
 
     @abstractmethod
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
-        """All outputs; fills the tape."""
+        """Compute all outputs, and fill the tape."""
 
     @abstractmethod
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
-        """Those of all outputs, [count, ...], from those of some inputs, [count, ...]."""
+        """Tangents of all outputs, [count, ...], from tangents of some inputs, [count, ...]."""
 
     @abstractmethod
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
     ) -> list[Tensor]:
-        """Those of some inputs, [losses, ...], from cotangents of all outputs, [losses, ...]."""
+        """Gradients of some inputs, from cotangents of all outputs; both [losses, ...]."""
 
 
 def evaluate(function: CoreFunction, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Outputs of a function at its inputs, with a graph."""
+    """Return the outputs of a function at its inputs, with a graph."""
     outputs: tuple[Tensor, ...] = _Evaluate.apply(function, *inputs)
     # From here on only the graph holds the tape: torch frees it after backward.
     function.tape = {}
@@ -95,7 +95,7 @@ class _Evaluate(torch.autograd.Function):
 
     @staticmethod
     def vmap(info, in_dims, function, *tensors):
-        """All directions of `jacfwd` have copies of the same inputs: one evaluation serves them."""
+        """Evaluate once: all directions of `jacfwd` have equal copies of the inputs."""
         outputs = _Evaluate.apply(function, *same_rows(tensors, in_dims[1:]))
         return outputs, (None,) * len(outputs)
 
@@ -130,7 +130,7 @@ class _Evaluate(torch.autograd.Function):
         return None, *(found.get(name) for name in names)
 
 
-# torch asks for it in every call, and inspect reads a function anew each time unless it is there.
+# torch calls `signature` in every call; without this attribute it inspects the function anew.
 _Evaluate.forward.__signature__ = signature(_Evaluate.forward)  # type: ignore[attr-defined]
 
 

@@ -1,4 +1,4 @@
-"""A wrapper of a simulator's methods: for their name, for lack of memory, and `torch.compile`."""
+"""A wrapper of methods: operation names, memory errors, and exclusion from `torch.compile`."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ _UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
 
 
 def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
-    """The method, excluded from `torch.compile`: there is nothing to fuse in a step."""
+    """Return the method, excluded from `torch.compile`: a step has nothing to fuse."""
     # Code that compiles has imported the compiler already.
     if not has_compiler():
         return method
     if method not in _UNCOMPILED:
-        # Else the compiler would compile this function again for each new entry.
+        # Otherwise the compiler would compile this function again for each new entry.
         compile_nothing_in(_uncompiled)
         _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
     return _UNCOMPILED[method]
 
 
 def uncompiled(method: Callable[P, T]) -> Callable[P, T]:
-    """Exclude a method, and all that it calls, from `torch.compile`."""
+    """Exclude a method, and all functions that it calls, from `torch.compile`."""
 
     @wraps(method)
     def call(*args: P.args, **keywords: P.kwargs) -> T:
@@ -43,11 +43,11 @@ def uncompiled(method: Callable[P, T]) -> Callable[P, T]:
 
 
 def guarded(method: Callable[P, T], name: str = "") -> Callable[P, T]:
-    """Name the operation in messages; raise torch's lack of memory as MemoryError, like NumPy.
+    """Name the operation in messages; raise memory errors of torch as MemoryError, like NumPy.
 
     Args:
-        method: What is called.
-        name: Name of the operation; by default that of the method.
+        method: The method.
+        name: Name of the operation; by default the name of the method.
     """
     operation = name or method.__name__
 

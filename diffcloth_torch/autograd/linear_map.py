@@ -1,8 +1,8 @@
-"""Tangents and gradients of a function of the core as linear functions, of one vector or of many.
+"""Tangents and gradients of a function of the core as linear functions of one or more vectors.
 
-A function of torch of its own, so that all directions or losses of a `vmap` go through one call of
-the core, and so that torch knows all that a derivative depends on. `once_differentiable` is not
-enough: where the cotangent has no graph, as for `.sum()`, the gradient would come back as a
+A separate function of torch, so that all directions or losses of a `vmap` go through one call of
+the core, and so that torch knows all dependences of a derivative. `once_differentiable` is not
+enough: if the cotangent has no graph, as for `.sum()`, the gradient would be returned as a
 constant, and a second derivative through it as zero.
 """
 
@@ -23,15 +23,15 @@ __all__ = ["LinearMap", "apply_map"]
 
 
 class LinearMap(NamedTuple):
-    """The derivative of a function of the core where it has been evaluated.
+    """The derivative of a function of the core at the point of its evaluation.
 
     Attributes:
-        owner: What messages say that the function is.
+        owner: Name of the function in messages.
         kind: "tangent" or "gradient".
-        saved_names: Of the tensors that the function has saved.
-        saved_shapes: Of these.
-        axes: Of the first vector, without those of directions or losses.
-        rows: From what is saved and vectors with one leading axis, the results with that axis.
+        saved_names: Names of the tensors that the function has saved.
+        saved_shapes: Shapes of these tensors.
+        axes: Number of axes of the first vector, without axes of directions or losses.
+        rows: Maps saved tensors and vectors with one leading axis to the results with that axis.
     """
 
     owner: str
@@ -45,7 +45,7 @@ class LinearMap(NamedTuple):
 def apply_map(
     linear: LinearMap, saved: Sequence[Tensor], vectors: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
-    """Results for vectors, which a `vmap` may give an axis more."""
+    """Return the results for vectors, which may have an additional axis from a `vmap`."""
     batched = [v for v in vectors if torch_private.is_batched_by_older_vmap(v)]
     if not batched:
         return _apply(linear, *saved, *vectors)
@@ -56,7 +56,7 @@ def apply_map(
 
 
 def _apply(linear: LinearMap, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """Results that know what they depend on, unless nothing can differentiate them."""
+    """Return results with their dependences, unless nothing can differentiate them."""
     is_watched = (
         torch.is_grad_enabled() or torch_private.in_forward_mode() or torch_private.in_transform()
     )
@@ -110,7 +110,7 @@ def _no_second(linear):
 
 
 def _check_saved(linear, saved):
-    """Refuse what hooks on saved tensors return instead of what was saved."""
+    """Refuse invalid tensors that hooks return instead of the saved ones."""
     for name, shape, tensor in zip(linear.saved_names, linear.saved_shapes, saved, strict=True):
         if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
             raise TypeError(

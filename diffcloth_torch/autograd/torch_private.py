@@ -2,7 +2,7 @@
 
 Public torch reports neither the transforms of `torch.func` around a call, nor the numbers inside
 their wrappers, nor the older vmap of `is_grads_batched`. `tests/autograd/test_torch_private.py`
-checks each function against the public behavior that it depends on; run it with a new torch first.
+checks each function against the public behavior on which it depends; run it first with a new torch.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def in_forward_mode() -> bool:
 
 
 def with_tangents() -> AbstractContextManager[None]:
-    """Allow tangents inside of the `jvp` of a Function, where torch computes none by itself."""
+    """Allow tangents inside of the `jvp` of a Function, where torch computes none by default."""
     enabled: AbstractContextManager[None] = forward_ad._set_fwd_grad_enabled(True)
     return enabled
 
@@ -69,7 +69,7 @@ def is_wrapped(tensor: Tensor) -> bool:
 
 
 def unwrap(tensor: Tensor) -> tuple[Tensor, int | None]:
-    """The tensor inside of a wrapper, and its axis of `torch.vmap`, None for other transforms."""
+    """Return the tensor in a wrapper, and its axis of `torch.vmap`, None for other transforms."""
     axis: int = _functorch.maybe_get_bdim(tensor)
     return _functorch.get_unwrapped(tensor), None if axis < 0 else axis
 
@@ -81,7 +81,7 @@ def is_batched_by_older_vmap(tensor: Tensor) -> bool:
 
 
 def _older_level() -> int:
-    """Level of the older vmap that is active."""
+    """Level of the active older vmap."""
     level: int = torch._C._vmapmode_increment_nesting() - 1
     torch._C._vmapmode_decrement_nesting()
     return level

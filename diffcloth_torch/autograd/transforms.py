@@ -1,8 +1,8 @@
 """The numbers of tensors that are being differentiated, also inside transforms of `torch.func`.
 
-What is computed outside torch reads numbers, and gives them their derivative again by a function of
-its own. Inside `torch.func.jvp` and the like a tensor is a wrapper without memory, and in
-`torch.func.jacfwd` it has one equal copy for each direction besides.
+A computation outside torch reads numbers, and attaches derivatives by a function of its own. Inside
+`torch.func.jvp` and similar transforms a tensor is a wrapper without memory, and in
+`torch.func.jacfwd` it also has one equal copy for each direction.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _CLOSE = 1e-13  # relative; batched products round by their batch
-_ONE_TRANSFORM = 2  # most interpreters of one: `jacfwd` is a vmap of a jvp
+_ONE_TRANSFORM = 2  # most interpreters of one transform: `jacfwd` is a vmap of a jvp
 
 
 def is_dense(value: Tensor) -> bool:
@@ -41,7 +41,7 @@ def is_dense(value: Tensor) -> bool:
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Whether a tensor has memory of its own: no transform is at work."""
+    """Return whether a tensor has memory of its own: no transform is active."""
     return not torch_private.is_wrapped(tensor)
 
 
@@ -49,7 +49,7 @@ def plain(tensor: Tensor) -> Tensor:
     """The numbers of a tensor as a tensor outside of all transforms, without graph or tangent.
 
     Raises:
-        NotImplementedError: If `torch.vmap` gives it different numbers in one call.
+        NotImplementedError: If `torch.vmap` assigns it different numbers in one call.
     """
     value = tensor
     with outside_transforms():
@@ -60,10 +60,10 @@ def plain(tensor: Tensor) -> Tensor:
 
 
 def same_rows(tensors: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
-    """Tensors without the axes of a vmap, along which all are equal but for rounding.
+    """Remove the axes of a vmap, along which tensors must be equal up to rounding.
 
     Raises:
-        NotImplementedError: If they are not.
+        NotImplementedError: If they are not equal.
     """
     pairs = zip(tensors, axes, strict=True)
     return [t if axis is None else _same_row(t, axis) for t, axis in pairs]
@@ -84,7 +84,7 @@ def _same_row(tensor: Tensor, axis: int) -> Tensor:
 
 
 def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
-    """Array of a tensor's numbers; shares its memory, without its graph."""
+    """Return an array of a tensor's numbers; shares its memory, without its graph."""
     if is_plain(tensor) and not torch_private.in_transform():
         return tensor.detach().numpy()
     value = plain(tensor)
@@ -93,14 +93,14 @@ def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
 
 
 def in_backward_transform() -> bool:
-    """Whether `torch.func.grad`, `vjp` or `jacrev` is at work."""
+    """Return whether `torch.func.grad`, `vjp` or `jacrev` is active."""
     return any(torch_private.transforms())
 
 
 def has_derivative(tensor: Tensor) -> bool:
-    """Whether a tensor is being differentiated; one that is made inside a transform need not be.
+    """Return whether a tensor is being differentiated; wrappers inside a transform need not be.
 
-    Inside transforms of transforms it is not known, and taken as true.
+    Inside nested transforms this is unknown, and assumed to be true.
     """
     if tensor.requires_grad or _has_tangent(tensor):
         return True
@@ -118,7 +118,7 @@ def has_derivative(tensor: Tensor) -> bool:
 
 
 def is_differentiated(tensors: Iterable[Tensor]) -> bool:
-    """Whether a derivative of one of these is wanted: backward, or forward."""
+    """Return whether a backward or forward derivative of one of these is requested."""
     tensors = list(tensors)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         return True

@@ -1,4 +1,4 @@
-"""The command `diffcloth export`: states of a file in the format of another program."""
+"""The command `diffcloth export`: converts states of a file to a format of another program."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def export(
 
     Args:
         source: File of `Trajectory.save` that ends in .pt.
-        target: The file to write; its ending names the format.
-        environment: The environment of a batch to write; None writes all of them.
-        overwrite: Whether to replace an existing file.
+        target: The file to write, in the format of its ending.
+        environment: The environment of a batch to write; None: all of them.
+        overwrite: If true, replace an existing file.
 
     Raises:
         InvalidInput: If a file or the environment is not accepted.

@@ -1,4 +1,4 @@
-"""The command `diffcloth fit`: fit a configuration to observations, and go on with a fit."""
+"""The command `diffcloth fit`: fit a configuration to observations, and resume a fit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from diffcloth_torch.viewers.fitted import FittedPage
 
 __all__ = ["fit_configuration", "resume_fit"]
 
-# Files in a folder of results. Evaluations lie in a folder, one file for each start.
+# Files in a folder of results. Evaluations are in a subfolder, one file for each start.
 _RESULT, _PAGE, _EVALUATIONS = "fit.json", "fit.html", "evaluations"
 
 
@@ -41,7 +41,7 @@ def fit_configuration(
 ) -> str:
     """Fit the variables of a configuration to its observations.
 
-    Arguments and errors are those of `run`.
+    Arguments and errors are as for `run`.
     """
     task = load_task(config, assignments)
     if not isinstance(task, Identify):
@@ -58,7 +58,7 @@ def fit_configuration(
 
 
 def resume_fit(folder: Path) -> str:
-    """Go on with a fit that was interrupted; it ends with the same bits.
+    """Resume a fit that was interrupted; the result has the same bits.
 
     Args:
         folder: Folder of its results.
@@ -141,9 +141,9 @@ def _short(value: Tensor) -> str:
 
 
 class _Progress:
-    """A progress bar over evaluations, whose number is not known; quiet without a terminal.
+    """A progress bar over evaluations, whose number is unknown; silent without a terminal.
 
-    A page shows the best of them so far.
+    A page shows the best evaluation so far.
     """
 
     def __init__(self, task: Identify, page: FittedPage | None) -> None:

@@ -1,7 +1,7 @@
 """The command line: run, optimize, fit, train, export, info.
 
-Commands import what they need when they run: torch takes seconds to import, and `diffcloth --help`
-or a misspelled option need not wait for it.
+Commands import modules when they run: torch takes seconds to import, and `diffcloth --help` or a
+misspelled option should not wait for it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ C = TypeVar("C", bound=Callable[..., Any])
 
 
 class _Program(click.Group):
-    """The commands; as a program, they end at once where the user interrupts them."""
+    """The commands; as a program, they end at once if the user interrupts them."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         try:
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def _ending_in_a_sentence(command: C) -> C:
-    """End the errors of a command with one sentence each, and with its exit code."""
+    """Report each error of a command in one sentence, and with its exit code."""
 
     @wraps(command)
     def guarded(debug: bool, **arguments: Any) -> None:

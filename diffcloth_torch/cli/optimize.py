@@ -39,7 +39,7 @@ from diffcloth_torch.viewers.curves import draw_loss_curve, require_matplotlib
 
 __all__ = ["optimize", "resume"]
 
-# Sections that may change when an optimization continues; others would change earlier results.
+# Sections that may change when an optimization is resumed; others would change earlier results.
 _RESUMABLE = ("optimizer", "output")
 
 
@@ -51,9 +51,9 @@ def optimize(
     overwrite: bool = False,
     actions: Path | None = None,
 ) -> str:
-    """Optimize the actions of a configuration, and show the best of them.
+    """Optimize the actions of a configuration, and show the best ones.
 
-    Arguments and errors are those of `run`.
+    Arguments and errors are as for `run`.
     """
     check_folder(config, out, overwrite, "optimize")
     task = load_task(config, assignments)
@@ -70,10 +70,9 @@ def optimize(
 
 
 def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
-    """Continue an optimization that was interrupted, or now has more iterations.
+    """Resume an optimization that was interrupted, or that now has more iterations.
 
-    The result has the same bits as without the interruption, if the build and the type of machine
-    are the same.
+    The result has the same bits as without the interruption on the same build and type of machine.
 
     Args:
         folder: Folder of its results.
@@ -99,7 +98,7 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
 
 
 def _checked(task: ConfiguredTask, kept: dict[str, Any]) -> tuple[Actions, Descent | None]:
-    """The first actions and the results so far, as a file has them.
+    """Return the first actions and the results so far from a file.
 
     Raises:
         InvalidInput: If they do not belong to the task.
@@ -112,7 +111,7 @@ def _checked(task: ConfiguredTask, kept: dict[str, Any]) -> tuple[Actions, Desce
     found = Descent.restore(kept["found"])
     check_like("the next actions", found.next_variables, example)
     check_like("the best rows", [found.best_rows, found.best_losses], [{}, cpu.zeros(0)])
-    # Whatever the momentum was, and will be.
+    # Independent of the momentum of the file and of the configuration.
     momenta = torch.optim.SGD([t.clone() for t in example.values()], lr=0.0, momentum=0.9)
     groups = momenta.state_dict()["param_groups"]
     state = {
@@ -137,7 +136,7 @@ def _optimize(
     require_matplotlib()
     viewers = open_viewers(task.config, task.scene, out, task.goals())
 
-    # After every iteration, so that an interruption loses only the current one.
+    # After each iteration, so that an interruption loses only the current one.
     def keep(sofar: Descent) -> None:
         nonlocal found
         found = sofar
@@ -155,7 +154,7 @@ def _optimize(
             f"diffcloth optimize --resume {out}"
         ) from error
     draw_loss_curve(out / "loss.png", found.metrics()["losses"])
-    # Only pages show them, and they cost another rollout.
+    # Only pages show gradients, which cost another rollout.
     gradients: list[Tensor | None] = [None] * len(found.best.states)
     if "web" in task.config.output.viewers:
         gradients = [*position_gradients(task, found.best.variables)]
@@ -177,7 +176,7 @@ def _write_optimization(task: OptimizableTask, found: Descent, out: Path) -> Non
         **values_used(task),
     }
     write_metrics(out / METRICS, metrics)
-    # torch reports a full disk as a RuntimeError where it writes the file itself.
+    # torch reports a full disk as a RuntimeError if it writes the file itself.
     archive = BytesIO()
     torch.save({"best": found.best.variables, "initial": found.first.variables}, archive)
     with replace_file(out / "actions.pt") as part:

@@ -1,4 +1,4 @@
-"""Folders of results: a lock, checks before the work, actions, files to resume from, metrics."""
+"""Folders of results: lock, checks before the work, actions, files to resume from, metrics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = [
     "write_resume",
 ]
 
-# Files in a folder of results, and folders, which are cleared by the viewers that write into them.
+# Files in a folder of results; the viewers clear the subfolders into which they write.
 METRICS, RESUME = "metrics.json", "resume.pt"
 _FILES = (
     *(METRICS, RESUME, "actions.pt", "actions.npz", "loss.png"),
@@ -49,18 +49,18 @@ _FILES = (
 )
 _FOLDERS = ("meshes", "animation_frames", "evaluation_frames", "evaluations", "events")
 
-_RESUME_BEFORE = "resume.json"  # before 0.2.0
+_RESUME_BEFORE = "resume.json"  # name before 0.2.0
 _LARGEST_ACTIONS = 256 << 20  # bytes of a file: no run of this code writes a tenth
 
 
 def check_folder(config: Path, out: Path | None, overwrite: bool, command: str = "") -> Path:
-    """Name the folder for results, and refuse one that holds others unless `overwrite`.
+    """Return the folder for results; refuse one with other results unless `overwrite`.
 
     Args:
-        config: The configuration, whose name is that of the folder by default.
+        config: The configuration; its name is the default name of the folder.
         out: The folder, or None.
-        overwrite: Whether it may hold other results.
-        command: The command that may go on with them, if one can.
+        overwrite: If true, the folder may contain other results.
+        command: The command that may resume them, if any.
     """
     folder = Path("results") / config.stem if out is None else out
     if folder.is_dir() and {file.name for file in folder.iterdir()} - {LOCK} and not overwrite:
@@ -78,11 +78,11 @@ def check_folder(config: Path, out: Path | None, overwrite: bool, command: str =
 def results_folder(
     config: Path, out: Path | None, overwrite: bool, command: str = ""
 ) -> Iterator[Path]:
-    """Yield the folder for results, locked; arguments are those of `check_folder`.
+    """Yield the folder for results, locked; arguments are as for `check_folder`.
 
     Raises:
-        InvalidInput: If another process uses the folder, or it holds other results.
-        OSError: If it cannot be written.
+        InvalidInput: If another process uses the folder, or it contains other results.
+        OSError: If the folder cannot be written.
     """
     folder = check_folder(config, out, overwrite, command)
     with locked("--out", folder):
@@ -96,7 +96,7 @@ def resumed_folder(folder: Path, command: str) -> Iterator[dict[str, Any]]:
 
     Raises:
         InvalidInput: If another process uses the folder, or it has no such file.
-        OSError: If it cannot be written.
+        OSError: If the folder cannot be written.
     """
     read_resume(folder, command)
     with locked("--resume", folder):
@@ -105,7 +105,7 @@ def resumed_folder(folder: Path, command: str) -> Iterator[dict[str, Any]]:
 
 
 def _check_places(folder: Path) -> None:
-    """Refuse, before the work, anything in the way of its results."""
+    """Refuse, before the work, folders at paths of files of results, and vice versa."""
     for name in (*_FILES, *(f"{name}{PART}" for name in _FILES)):
         if (folder / name).is_dir():
             raise InvalidInput(
@@ -125,7 +125,7 @@ def clear(folder: Path) -> None:
 
 
 def read_actions(task: ConfiguredTask, file: Path | None) -> Actions:
-    """The initial actions of a task, or those in a file."""
+    """Return the initial actions of a task, or the actions in a file."""
     actions = task.actions()
     if file is None:
         return actions
@@ -144,7 +144,7 @@ def read_actions(task: ConfiguredTask, file: Path | None) -> Actions:
                 given = {name: arrays[name] for name in wanted}
     except MemoryError:
         raise
-    except Exception as error:  # whatever zipfile and NumPy raise for other bytes
+    except Exception as error:  # any error of zipfile and NumPy about other bytes
         raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
     if got != wanted:
         raise InvalidInput(f"--actions: {file} must hold {_shapes(wanted)}, got {_shapes(got)}")
@@ -154,7 +154,7 @@ def read_actions(task: ConfiguredTask, file: Path | None) -> Actions:
 
 
 def _claims(file: BytesIO) -> dict[str, tuple[list[int], np.dtype[Any]]]:
-    """Shapes and types that the headers of an .npz claim, without reading its numbers."""
+    """Shapes and types in the headers of an .npz, without reading its numbers."""
     claims = {}
     with zipfile.ZipFile(file) as entries:
         for entry in entries.namelist():
@@ -179,15 +179,15 @@ def write_resume(
         folder: Folder of the results.
         command: The command.
         document: The configuration.
-        source: File that it was read from.
-        content: Whatever else the command goes on with, in types that `torch.load` reads.
+        source: File from which it was read.
+        content: Further data for the command, in types that `torch.load` reads.
     """
     kept = {"config": document, "source": str(source.resolve()), **content}
     write_checkpoint(folder / RESUME, command, kept)
 
 
 def read_resume(folder: Path, command: str) -> dict[str, Any]:
-    """Read a file of `write_resume`, whose `source` becomes a Path.
+    """Read a file of `write_resume`; its `source` becomes a Path.
 
     Raises:
         InvalidInput: If there is no such file, or its content is damaged.
@@ -235,10 +235,10 @@ def step_records(states: Sequence[State]) -> list[dict[str, Any]]:
 
 
 def values_used(task: ConfiguredTask) -> dict[str, Any]:
-    """The configuration, and the values that it leaves at their defaults.
+    """Return the configuration, and the values that it leaves at their defaults.
 
-    `used` has the options of contact and solver, the bending model of each cloth, and all
-    parameters except the rest positions, which are those of the mesh.
+    `used` contains the options of contact and solver, the bending model of each cloth, and all
+    parameters except the rest positions, which equal the mesh.
     """
     simulator = task.simulator
     parameters = simulator.parameters()

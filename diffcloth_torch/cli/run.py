@@ -43,14 +43,14 @@ def run(
         config: YAML file.
         assignments: "key=value" each, see `set_values`.
         out: Folder for the results; by default results/ and the name of `config`.
-        overwrite: Whether to replace existing results.
-        actions: File `actions.npz` of a run whose actions are used instead of the initial ones.
-        save: File for all states, the first one included; see `Trajectory.save`.
+        overwrite: If true, replace existing results.
+        actions: File `actions.npz` of a run with actions to use instead of the initial ones.
+        save: File for all states, including the first one; see `Trajectory.save`.
 
     Raises:
         InvalidInput: If an argument or the configuration is not accepted.
         SimulationError: If a step fails; earlier results are kept.
-        KeyboardInterrupt: If the user ends the run; the message says what is kept.
+        KeyboardInterrupt: If the user ends the run; the message lists the results that are kept.
     """
     check_folder(config, out, overwrite)
     if save is not None:

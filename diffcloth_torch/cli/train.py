@@ -1,4 +1,4 @@
-"""The command `diffcloth train`: train a policy, and go on with a training."""
+"""The command `diffcloth train`: train a policy, and resume a training."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from diffcloth_torch.viewers.show import show
 
 __all__ = ["resume_training", "train"]
 
-# Files in a folder of results; TensorBoard reads those of a folder.
+# Files in a folder of results; TensorBoard reads the files of a folder.
 _RESULT, _POLICY, _EVENTS = "train.json", "policy.pt", "events"
 _VIDEO = "evaluation"
 _EVALUATION = {"updates": 0, "steps": 0, "return": 0.0, "success": 0.0, "seconds": 0.0}
-_NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # what a trainer decides
+_NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # set by the trainer
 
 _Workers = Processes | RayActors | Ranks | None
 
@@ -57,7 +57,7 @@ def train(
 ) -> str:
     """Train the policy of a configuration.
 
-    Arguments and errors are those of `run`.
+    Arguments and errors are as for `run`.
     """
     section = _check(set_values(read_document(config), assignments), config)
     workers = _workers(section.workers)
@@ -74,7 +74,7 @@ def train(
 
 
 def resume_training(folder: Path) -> str:
-    """Go on with a training that was interrupted; it goes on with the same bits.
+    """Resume a training that was interrupted; it continues with the same bits.
 
     Args:
         folder: Folder of its results.
@@ -106,7 +106,7 @@ def _check(document: dict[str, Any], source: Path) -> TrainConfig:
 
 
 class _Job:
-    """A training: its trainer, its workers, and what it has found so far."""
+    """A training: its trainer, its workers, and its results so far."""
 
     def __init__(self, section: TrainConfig, source: Path, workers: _Workers) -> None:
         self.section, self._source = section, source.resolve()
@@ -143,7 +143,7 @@ class _Job:
 
         Args:
             out: Folder of the results.
-            evaluations: So far.
+            evaluations: Evaluations so far.
             trainer: State of the trainer, None before its first evaluation.
         """
         document = self.section.model_dump(mode="json", exclude_unset=True)
@@ -151,7 +151,7 @@ class _Job:
         write_resume(out, "train", document, self._source, **found)
 
     def restore(self, kept: dict[str, Any]) -> list[dict[str, Any]]:
-        """Go on with the content of a file of `keep`; returns the evaluations so far.
+        """Continue from the content of a file of `keep`; return the evaluations so far.
 
         Raises:
             InvalidInput: If it does not belong to this training.
@@ -171,7 +171,7 @@ class _Job:
         return evaluations
 
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
-        """Learn until the end, and write what was found."""
+        """Learn until the end, and write the results."""
         before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
         states: list[State] = []
         try:
@@ -204,10 +204,10 @@ class _Job:
     def _try_out(
         self, out: Path, tryout: TryoutSection, before: float
     ) -> tuple[list[State], list[dict[str, Any]]]:
-        """Let each seed learn for a while; from then on this is a training of the best one.
+        """Train each seed for a while; this object then trains the best one.
 
         Returns:
-            The states of its last evaluation, and all its evaluations.
+            The states of the best seed's last evaluation, and all its evaluations.
         """
         found = []
         for seed in tryout.seeds:
@@ -219,7 +219,7 @@ class _Job:
             found.append((self.trainer, states, evaluations))
             if self._succeeds(evaluations):
                 break
-        # The first of those that are equal.
+        # The first one among equals.
         self.trainer, states, evaluations = max(found, key=lambda each: each[2][-1]["return"])
         trained = {**self.section.trainer, "seed": self.trainer.options.seed}
         self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
@@ -235,17 +235,17 @@ class _Job:
         log: Path,
         out: Path | None = None,
     ) -> list[State]:
-        """Learn until so many updates are done or enough episodes succeed.
+        """Learn until a number of updates is done or enough episodes succeed.
 
         Args:
-            updates: Those at the end.
-            evaluations: So far; more are appended.
-            before: When the training began.
+            updates: Total number of updates at the end.
+            evaluations: Evaluations so far; more are appended.
+            before: Start time of the training.
             log: Folder of TensorBoard's events.
             out: Folder in which each evaluation and its policy are kept.
 
         Returns:
-            The states of the last evaluation, none if nothing was left to do.
+            The states of the last evaluation; empty if nothing was left to do.
         """
         from torch.utils.tensorboard import SummaryWriter
 
@@ -300,7 +300,7 @@ class _Job:
         self.keep(out, evaluations, record_of(self.trainer))
 
     def _film(self, out: Path, states: list[State]) -> None:
-        """Show the first episode of the last evaluation, or in the browser all of them."""
+        """Show the first episode of the last evaluation, or all of them in the browser."""
         task, options = self.trainer.task, self.section.pictures.model_dump()
         scene: Scene = task.simulator.scene
         camera = Camera(**options["camera"])
@@ -328,7 +328,7 @@ def _workers(section: WorkersSection) -> _Workers:
 
 
 def _named(where: str, options: type[TrainerOptions], given: dict[str, Any]) -> TrainerOptions:
-    """Options by their names, with lists as tuples."""
+    """Make options from a mapping, with lists as tuples."""
     accepted = [field.name for field in fields(options)]
     for name in given:
         if name not in accepted:

@@ -1,4 +1,4 @@
-"""Attachments of a configuration, and what their targets and weights do."""
+"""Attachments of a configuration, and the motion of their targets and weights."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def attachment_motions(
 ) -> dict[str, dict[str, Tensor]]:
     """Targets [steps, n, 3] and weights [steps, n] of attachments by name, after each step.
 
-    Targets start where the points of the first end are; without keyframes they stay there.
+    Targets start at the points of the first end; without keyframes they stay there.
     """
     targets: dict[str, Tensor] = {}
     weights: dict[str, Tensor] = {}
@@ -68,7 +68,7 @@ def attachment_motions(
 
 
 def _starts(scene: Scene, rows: slice) -> Tensor:
-    """Where the first ends of springs to targets are at the start, [n, 3]."""
+    """Initial positions of the first ends of springs to targets, [n, 3]."""
     placed = [cloth.vertices for cloth in scene.cloths]
     placed += [transform(body.vertices, body.pose) for body in scene.bodies]
     vertices = np.concatenate(placed)

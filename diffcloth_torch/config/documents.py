@@ -28,10 +28,10 @@ Document = dict[str, Any]
 # A configuration is a page of text. A file that exceeds these generous bounds is a mistake, or
 # would fill the memory.
 _LARGEST_CONFIG_BYTES = 1 << 20
-_MOST_VALUES = 100_000  # aliases written out
+_MOST_VALUES = 100_000  # including written-out aliases
 _DEEPEST = 50
 
-_SET = "--set"  # of the command line
+_SET = "--set"  # option of the command line
 
 
 def read_document(path: str | Path) -> Document:
@@ -39,7 +39,7 @@ def read_document(path: str | Path) -> Document:
 
     Raises:
         InvalidInput: If the file is missing, too large, no regular file, not YAML, not a mapping,
-            nested too deeply, holds itself, or repeats a key.
+            nested too deeply, contains itself, or repeats a key.
     """
     path = Path(path)
     try:
@@ -56,10 +56,10 @@ def read_document(path: str | Path) -> Document:
 
 
 def check_plain_document(document: Mapping[str, Any]) -> Document:
-    """Copy a configuration that is no file; it may hold what a file may hold.
+    """Copy a configuration that is not a file; the rules for files apply.
 
     Raises:
-        InvalidInput: If it is nested too deeply or holds other values than text and numbers.
+        InvalidInput: If it is nested too deeply or contains values other than text and numbers.
     """
     try:
         copy: Document = _plain_copy(document, _DEEPEST)
@@ -70,7 +70,7 @@ def check_plain_document(document: Mapping[str, Any]) -> Document:
 
 
 def _plain_copy(value: Any, levels: int) -> Any:
-    """Mappings as dicts, tuples as lists."""
+    """Copy mappings as dicts and tuples as lists."""
     if not isinstance(value, Mapping | list | tuple):
         return value
     if levels == 0:
@@ -91,14 +91,14 @@ def _parse(text: str) -> Any:
     except MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
         raise ValueError(f"{line}{error.problem or error.context}") from error
-    except Exception as error:  # also what Python's own conversions of dates and numbers raise
+    except Exception as error:  # also errors of Python's conversions of dates and numbers
         raise ValueError(str(error)) from error
     _check_plain(document, "the file")
     return document
 
 
 def _check_extent(events: Iterable[Any]) -> None:
-    """Bound depth and size of a document as if its aliases were written out."""
+    """Bound depth and size of a document, counting aliases as if written out."""
     sizes: dict[str, int] = {}  # of anchored values
     anchors: set[str] = set()
     opened: list[tuple[str | None, int]] = []  # anchor of a collection, and values before it
@@ -131,7 +131,7 @@ def _check_extent(events: Iterable[Any]) -> None:
 
 
 def _check_plain(value: Any, place: str) -> None:
-    """Refuse YAML values that no configuration has: dates, sets, keys that are not text."""
+    """Refuse YAML values that are not allowed in configurations: dates, sets, non-text keys."""
     if isinstance(value, dict):
         for key, entry in value.items():
             if not isinstance(key, str):
@@ -149,7 +149,7 @@ def _one_line(error: Exception) -> str:
 
 
 def set_values(document: Document, assignments: Iterable[str]) -> Document:
-    """Copy a document with values changed.
+    """Copy a document with changed values.
 
     Args:
         document: Contents of a configuration file.
@@ -226,7 +226,7 @@ def resolve_path(config: Path, root: str, given: str) -> Path:
     """Resolve a file name relative to its configuration, and require it to be under the root.
 
     Raises:
-        InvalidInput: If it lies elsewhere or does not exist.
+        InvalidInput: If the file lies elsewhere or does not exist.
     """
     allowed = resolve_relative(config, root)
     path = resolve_relative(config, given)

@@ -1,4 +1,4 @@
-"""The schema of fits in configurations: what is searched, and what was observed."""
+"""The schema of fits in configurations: variables and observations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Numbers = float | list[float]
 
 
 class VariableSection(Section):
-    """What a fit may change, as in `Variable`."""
+    """A variable of a fit, as in `Variable`."""
 
     value: Numbers
     bounds: Annotated[list[float], Len(2, 2)] | None = None
@@ -37,10 +37,10 @@ class VariableSection(Section):
 
 
 class SyntheticSection(Section):
-    """Observations that another simulation makes, to try a fit where the truth is known.
+    """Observations from another simulation, to test a fit with known values.
 
     `changes` are assignments to the configuration, as after `--set`: a finer mesh, a smaller time
-    step. `values` are those of the variables; the standard deviation of the noise is that of the
+    step. `values` are the true values of the variables; the noise has the standard deviation of the
     trajectory.
     """
 
@@ -50,12 +50,13 @@ class SyntheticSection(Section):
 
 
 class TrajectorySection(Section):
-    """What was observed of one motion, or of one equilibrium.
+    """Observations of one motion, or of one equilibrium.
 
-    `changes` are assignments to the configuration that make this motion, as after `--set`. The
+    `changes` are assignments to the configuration that define this motion, as after `--set`. The
     cloth is observed after each of `steps`, or once at `equilibrium`. `file` is an .npz with the
-    `positions` [T, m, 3] of the `markers` (NaN where one was not seen), or with the `outlines`
-    [T, n, 2] of silhouettes seen from above, around `center`, about which they may be `turned`.
+    `positions` [T, m, 3] of the `markers` (NaN for markers that were not visible), or with the
+    `outlines` [T, n, 2] of silhouettes seen from above, around `center`, about which they may be
+    `turned`.
     """
 
     name: str
@@ -108,6 +109,6 @@ class FitSection(Section):
 
 
 class FitConfig(RunConfig):
-    """A scene, and what a fit is to find in it."""
+    """A scene, and a fit of its variables."""
 
     fit: FitSection

@@ -1,4 +1,4 @@
-"""What sections say, in numbers: rotations, selected vertices, motion between keyframes."""
+"""Arrays from sections: rotations, selected vertices, motion between keyframes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def quaternion(section: RotationSection) -> NDArray[np.float64]:
 def select_vertices(
     name: str, selection: Selection, vertices: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Vertices that a selection names, in increasing order but for a list, which keeps its own."""
+    """Indices of selected vertices, in increasing order; a list of indices keeps its order."""
     if selection.vertices is not None:
         return np.array(selection.vertices)
     if selection.nearest is not None:
@@ -69,7 +69,7 @@ def moved(start: Tensor, keyframes: Sequence[PinKeyframe], times: Tensor) -> Ten
 
 
 def values_at(keyframes: Sequence[JointKeyframe], start: float, times: Tensor) -> Tensor:
-    """Values [n] at some times, on straight lines between keyframes."""
+    """Values [n] at some times, linear between keyframes."""
     given = [(frame.time, frame.value) for frame in keyframes]
     given = given if given[0][0] == 0 else [(0.0, start), *given]
     at, values = np.array(given).T

@@ -96,7 +96,7 @@ Fabric = Literal[
 class MaterialSection(_MaterialFields):  # type: ignore[misc]  # its fields are those of Material
     """Properties of a cloth, in the units of `Material`, with its defaults.
 
-    Of a `fabric`, whose numbers are those of `dc.fabrics`, only what is to be another is given.
+    With a `fabric`, properties default to the numbers of `dc.fabrics`.
     """
 
     fabric: Fabric | None = None
@@ -177,14 +177,14 @@ Names = Annotated[list[str], Len(2, 2)]
 ForAll = float | dict[str, float]
 """One value for all, or name -> value."""
 Bounds = Literal[False] | float | dict[str, Literal[False] | float]
-"""Likewise, where false means none."""
+"""Likewise; false means none."""
 
 
 class RobotSection(Section):
     """A robot, from the URDF file at `path`, or a known one by its name `model`.
 
-    Its fields are those of `Robot.load`. With a `trajectory` its base is kinematic and starts at
-    `pose` at time 0. Joints without a trajectory hold.
+    Its fields are the arguments of `Robot.load`. With a `trajectory` its base is kinematic and
+    starts at `pose` at time 0. Joints without a trajectory hold.
     """
 
     name: str
@@ -240,7 +240,7 @@ class EndSection(Section):
         return self
 
     def selection(self) -> Selection:
-        """What is selected of a cloth."""
+        """The selection of vertices of a cloth."""
         return Selection(vertices=self.vertices, box=self.box, nearest=self.nearest)
 
 
@@ -253,8 +253,8 @@ class WeightKeyframe(JointKeyframe):
 class AttachmentSection(Section):
     """Springs between two ends, or between `a` and targets, as in `Attachment`.
 
-    Without `b` there are targets; they start where `a` is and move by `target_trajectory`. Weights
-    are one where `weight_trajectory` says nothing.
+    Without `b` there are targets; they start at the points of `a` and move by `target_trajectory`.
+    Weights are one outside of `weight_trajectory`.
     """
 
     name: str
@@ -277,7 +277,7 @@ class AttachmentSection(Section):
 
 
 class AirSection(Section):
-    """Density of the air [kg/m^3], and its steady velocity [m/s], which cloths with drag feel."""
+    """Density of the air [kg/m^3], and its steady velocity [m/s], for cloths with drag."""
 
     density: Annotated[float, limits("air_density")] | None = None
     wind: Vector3 | None = None

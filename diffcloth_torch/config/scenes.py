@@ -1,4 +1,4 @@
-"""From a configuration to its scene, its simulator and its prescribed motion."""
+"""The scene, the simulator and the prescribed motion of a configuration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ __all__ = [
 
 
 def build_scene(config: RunConfig, source: Path) -> Scene:
-    """Make the cloths and bodies of a configuration that was read from the file `source`."""
+    """Make the scene of a configuration that was read from the file `source`."""
     _require_unique_names(config)
     cloths = [_cloth(section, config.root, source) for section in config.scene.cloths]
     bodies = [_body(section, config.root, source) for section in config.scene.bodies]
@@ -69,7 +69,7 @@ def build_scene(config: RunConfig, source: Path) -> Scene:
 
 
 def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
-    """Make the simulator of a scene; options that the configuration leaves out take defaults."""
+    """Make the simulator of a scene; options that the configuration leaves out have defaults."""
     return Simulator(
         scene,
         section.dt,
@@ -199,7 +199,7 @@ def _robot(section: RobotSection, root: str, source: Path) -> Robot:
 
 
 def _robot_file(section: RobotSection, root: str, source: Path) -> tuple[Path, Path | None]:
-    """The file of a robot, and the folder that its meshes must lie in; None for any place."""
+    """The file of a robot, and the folder that must contain its meshes; None for any folder."""
     if section.model is not None:
         return robots.panda() if section.model == "panda" else (robots.GRIPPER, None)
     assert section.path is not None  # the schema requires one of the two
@@ -253,7 +253,7 @@ class PerStep(Protocol):
     """Values after each step: a tensor of all of them, or an object that makes them on request."""
 
     def __getitem__(self, k: int, /) -> Tensor:
-        """Give the values of the step k."""
+        """Return the values of step k."""
         ...
 
 
@@ -262,11 +262,11 @@ Motions = dict[str, dict[str, PerStep]]
 
 
 Trajectories = dict[str, dict[str, Tensor]]
-"""Motions that are known from the start, shape [steps, ..]."""
+"""Motions known from the start, shape [steps, ..]."""
 
 
 def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Trajectories:
-    """What pins, bodies, bases, joints and attachments that have trajectories do."""
+    """Prescribed motions of pins, bodies, bases, joints and attachments with trajectories."""
     dt = config.simulation.dt
     poses: Trajectories = {"body_poses": {}, "base_poses": {}}
     for body in config.scene.bodies:
@@ -289,7 +289,7 @@ def steady_wind(config: RunConfig) -> Tensor | None:
 def step_control(
     motions: Mapping[str, Mapping[str, PerStep]], k: int, wind: Tensor | None
 ) -> Control:
-    """Control of the step k from motions of all steps, and from the wind."""
+    """Return the control of step k from motions of all steps, and from the wind."""
     fields: dict[str, Any] = {
         field: {name: values[k] for name, values in named.items()}
         for field, named in motions.items()
@@ -327,7 +327,7 @@ _JOINT_FIELDS = {
 
 
 def _joint_field(robot_name: str, joint: str, robot: Robot) -> tuple[str, float]:
-    """Field of a control that a joint's trajectory is for, and where it starts."""
+    """Field of a control that a joint's trajectory sets, and the value at its start."""
     names = robot.joint_names
     if joint not in names:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""The schema of configurations, against which files are checked before anything runs."""
+"""The schema of configurations; files are checked against it before anything runs."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class PictureSection(Section):
 
 
 class OutputSection(Section):
-    """Output of a run: a frame for each of the `viewers` after `every` so many steps."""
+    """Output of a run: a frame for each of the `viewers` after every `every` steps."""
 
     viewers: list[Literal["record", "meshes", "web"]] = ["record", "meshes"]
     every: Count = 1
@@ -129,10 +129,10 @@ class OptimizerSection(Section):
     """Stochastic gradient descent.
 
     `learning_rates` has one entry for each tensor of actions. `clip` limits the norm of the
-    gradient of each of them; by default nothing is clipped. With `restart`, momentum is reset to
+    gradient of each tensor; by default nothing is clipped. With `restart`, momentum is reset to
     zero whenever the loss has risen, so that it does not swing across a narrow valley. `failures`
-    is the number of successive attempts that may fail. `stop_below` ends the loop when the loss is
-    smaller.
+    is the number of successive attempts that may fail. `stop_below` is the loss below which the
+    loop ends.
     """
 
     iterations: Updates
@@ -149,8 +149,8 @@ class OptimizerSection(Section):
 class RunConfig(Section):
     """The keys that every configuration has.
 
-    `root` is the folder, relative to the configuration, that mesh files must lie under; by
-    default the folder of the configuration. Tasks add keys of their own.
+    `root` is the folder, relative to the configuration, that must contain mesh files; by default
+    the folder of the configuration. Tasks add keys of their own.
     """
 
     task: str

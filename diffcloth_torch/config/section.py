@@ -1,4 +1,4 @@
-"""What sections of configurations are made of: strict mappings, numbers with ranges."""
+"""Elements of sections of configurations: strict mappings, numbers with ranges."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = [
 ]
 
 Count = Annotated[int, Ge(1), Le(10**8)]
-"""A count of steps and the like: a day has fewer of the fastest steps."""
+"""A count of steps or similar; a day of the fastest steps has fewer than the upper end."""
 
 Updates = Annotated[int, Ge(1), Le(10**7)]
-"""A count of updates or evaluations: a day has fewer of the fastest ones."""
+"""A count of updates or evaluations; a day of the fastest ones has fewer than the upper end."""
 
 Seed = Annotated[int, Ge(0), Le(2**31 - 1)]
 Positive = Annotated[float, Gt(0)]
@@ -46,7 +46,7 @@ Lengths3 = Positive | Annotated[list[Positive], Len(3, 3)]
 
 
 def limits(parameter: str) -> Interval:
-    """Range of a parameter's values, as a configuration's schema has it."""
+    """Range of a parameter's values for the schema of a configuration."""
     accepted = PARAMETERS[parameter].accepted
     low = None if math.isinf(accepted.low) else accepted.low
     high = None if math.isinf(accepted.high) else accepted.high
@@ -88,6 +88,6 @@ def require_one(section: Section, names: Iterable[str]) -> None:
 
 
 def require_increasing(name: str, times: Sequence[float]) -> None:
-    """Refuse keyframes whose times do not increase."""
+    """Refuse keyframes with times that do not increase."""
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise ValueError(f"must have increasing times in `{name}`, got {times}")

@@ -86,7 +86,7 @@ class MeshFile(Section):
 
 
 class ClothFile(MeshFile):
-    """A mesh file of a cloth, and a second one of its stress-free shape if that differs."""
+    """A mesh file of a cloth, and optionally another one of its stress-free shape."""
 
     rest: str | None = None
 
@@ -172,7 +172,7 @@ class Plane(Section):
 
 
 class Chair(Section):
-    """Chair that stands on z = 0 and faces -y; lengths in meters, `height` is that of the seat."""
+    """Chair that stands on z = 0 and faces -y; lengths in meters, `height` of the seat."""
 
     kind: Literal["chair"]
     width: Positive = 0.44

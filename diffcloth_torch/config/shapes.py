@@ -13,7 +13,7 @@ __all__ = ["chair", "disk"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
-# Edges across a disk: fewer do not make a round sheet, more are too many to simulate.
+# Edges across a disk: fewer do not form a round sheet, more are too many to simulate.
 _FEWEST_EDGES = 2
 _MOST_EDGES = 100
 
@@ -35,7 +35,7 @@ def disk(
     """Round sheet in the xy-plane that faces up, on an unstructured mesh.
 
     A Delaunay triangulation joins the points of a disturbed lattice inside a ring of evenly spaced
-    points, and is smoothed. The same arguments give the same mesh.
+    points, and is smoothed. Equal arguments yield equal meshes.
 
     Folds are waves along the rim, upwards from the plane. They grow with the fourth power of the
     distance from the middle, which stays flat.
@@ -142,7 +142,7 @@ Interval = tuple[float, float]
 
 
 def union_of_boxes(boxes: list[tuple[Interval, Interval, Interval]], edge_length: float) -> Mesh:
-    """Surface of a union of boxes: that of the cells they fill between the planes of their sides.
+    """Surface of a union of boxes: of all cells inside boxes, between the planes of their sides.
 
     No face lies inside or occurs twice, so boxes may touch and overlap.
 
@@ -181,7 +181,7 @@ def union_of_boxes(boxes: list[tuple[Interval, Interval, Interval]], edge_length
 
 
 def _subdivided(ends: set[float], longest: float) -> NDArray[np.float64]:
-    """Sorted coordinates, with others between those further apart than `longest`."""
+    """Sorted coordinates, with additional ones where the distance exceeds `longest`."""
     coordinates = sorted(ends)
     parts = [
         np.linspace(a, b, int(np.ceil((b - a) / longest)) + 1)[:-1]

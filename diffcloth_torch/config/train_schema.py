@@ -21,7 +21,7 @@ class EnvironmentSection(Section):
 
 
 class WorkersSection(Section):
-    """Who makes the rollouts: this process, others, actors of Ray, or the ranks of torchrun.
+    """Workers for rollouts: this process, others, actors of Ray, or the ranks of torchrun.
 
     `deadline` is the longest time of a rollout of a chunk [s].
     """
@@ -33,19 +33,19 @@ class WorkersSection(Section):
 
 
 class TryoutSection(Section):
-    """Seeds that each learn for a few updates; the best of them goes on."""
+    """Seeds that each learn for a few updates; training continues with the best of them."""
 
     seeds: Annotated[list[Seed], MinLen(2)]
     updates: Updates
 
 
 class TrainConfig(Section):
-    """Environments, the options of `TrainerOptions`, and how long to learn.
+    """Environments, the options of `TrainerOptions`, and the length of training.
 
     The policy is evaluated, and kept, at first, after each `evaluate_every` updates and at the end,
-    in `episodes` episodes of their own. With `until_success` training ends before its last update,
-    as soon as that share of them succeeds. With `tryout` the seed of `trainer` is the one with the
-    largest return after the updates there, which count as the first ones.
+    in `episodes` separate episodes. With `until_success` training ends before its last update, as
+    soon as this share of episodes succeeds. With `tryout` the seed of `trainer` is the one with the
+    largest return after the updates of the tryout, which count as the first ones.
     """
 
     task: Literal["train"]

@@ -1,4 +1,4 @@
-"""The check of a document against a schema, with errors in the words of the file."""
+"""The check of a document against a schema, with error messages in the terms of the file."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def validate(model: type[S], document: Document, source: str | Path) -> S:
     """Check a document against a schema.
 
     Raises:
-        InvalidInput: If a key is unknown or missing, or a value is not accepted; the message
-            names the key, the value and what is accepted.
+        InvalidInput: If a key is unknown or missing, or a value is not accepted; the message names
+            the key, the value and the accepted values.
     """
     try:
         return model.model_validate(document)
@@ -50,7 +50,7 @@ def _sentences(document: Document, problems: Iterable[Any]) -> list[str]:
 
 
 def _is_number(problem: Any) -> bool:
-    """Whether a number is wanted."""
+    """Return whether a number is required."""
     return str(problem["type"]).partition("_")[0] in ("float", "int")
 
 

@@ -1,4 +1,4 @@
-"""From a configuration to its viewers."""
+"""The viewers of a configuration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from diffcloth_torch.viewers.viewer import Viewer
 __all__ = ["ANIMATION", "VIEWERS", "open_fitted", "open_viewers"]
 
 ANIMATION = "animation.html"
-"""File that the viewer `web` writes into a folder of results."""
+"""File of the viewer `web` in a folder of results."""
 
 
 def open_viewers(
@@ -29,9 +29,9 @@ def open_viewers(
 
     Args:
         config: The configuration.
-        scene: The scene that was built from it.
+        scene: The scene of the configuration.
         folder: Existing folder for their files.
-        goals: Shapes to show beside the scene.
+        goals: Target shapes to show.
     """
     output = config.output
     made = [make(config, scene, folder, goals) for name, make in VIEWERS if name in output.viewers]
@@ -39,7 +39,7 @@ def open_viewers(
 
 
 def open_fitted(config: RunConfig, scenes: Sequence[Scene], folder: Path) -> FittedPage | None:
-    """Make the page of a fit, if the configuration wants one.
+    """Make the page of a fit, if the configuration requests one.
 
     Args:
         config: The configuration.
@@ -90,7 +90,7 @@ def _web(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -
         paints=_paints(config),
         goals=goals,
         camera=Camera(**pictures.model_dump()["camera"]),
-        # Gradients are given by an optimization alone; without them there are no such arrows.
+        # Only an optimization has gradients; otherwise there are no such arrows.
         arrows=["forces", "gradient"] if pictures.contact_forces else ["gradient"],
         file=folder / ANIMATION,
         live=_is_watched(),
@@ -102,4 +102,4 @@ VIEWERS: tuple[tuple[str, Callable[[RunConfig, Scene, Path, Sequence[Goal]], Vie
     ("meshes", _meshes),
     ("web", _web),
 )
-"""Name in a configuration, and what makes the viewer; shown in this order."""
+"""Name in a configuration, and function that makes the viewer; shown in this order."""

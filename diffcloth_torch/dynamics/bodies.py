@@ -1,11 +1,11 @@
 """Free rigid bodies over one step, all of them at once.
 
-A body by itself follows Euler's equations to rounding. With the angular momentum L about the
-center, in world axes, and the inertia J in body axes, it keeps L + h torque and turns by a rotation
-Q that the core finds, R_pred = R_n Q. Its coordinates are the center c and the rotation vector w
-with R = exp(w) R_pred; the core adds the inertia 1/(2h^2) (m |c - c^|^2 + w^T I w) about the
-prediction to the objective that it minimizes. At the solution its gradient balances the contact
-force, which gives the body its momentum after the step: contact conserves the total momentum.
+A free body follows Euler's equations to rounding. With the angular momentum L about the center, in
+world axes, and the inertia J in body axes, it keeps L + h torque and turns by a rotation Q that the
+core computes, R_pred = R_n Q. Its coordinates are the center c and the rotation vector w with R =
+exp(w) R_pred; the core adds the inertia 1/(2h^2) (m |c - c^|^2 + w^T I w) about the prediction to
+its objective. At the solution its gradient balances the contact force, which determines the
+momentum of the body after the step: contact conserves the total momentum.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ __all__ = [
     "turn_sentence",
 ]
 
-# Largest turn [rad] of a body in a step: by itself, because the core's series would get long; and
-# in contact before or after the step, because contact at its end does not describe the way there
-# and gives energy to a body that turns further.
+# Largest turn [rad] of a body in a step: for free motion, because the core's series would get long;
+# and in contact before or after the step, because contact at its end does not describe the path
+# there and adds energy to a body that turns further.
 _MOST_TURN = 1e3
 MOST_TURN_IN_CONTACT = 1.0
 
@@ -123,7 +123,7 @@ def turn_sentence(name: str, speed: float, dt: float, most: float, how: str) -> 
 
 
 def _refuse_turns(lost: Tensor, speed: Tensor, dt: float, names: Sequence[str]) -> None:
-    """Raise for bodies whose free turn has no solution, [B, K]; at least one must be true."""
+    """Raise an error for bodies whose free turn has no solution, [B, K]; at least one is true."""
     first, body = lost.nonzero()[0].tolist()
     name = f"body {names[body]!r}" if names else f"body {body}"
     sentence = turn_sentence(name, float(speed[first, body]), dt, _MOST_TURN, "may")

@@ -69,11 +69,11 @@ class Prediction:
         coordinate_ends: Coordinates at the end if they are prescribed, [B, n].
         coordinate_targets: t of the term (q - t)^T A (q - t) / 2 of the objective, [B, n].
         coordinate_metric: A, row by row, mechanism after mechanism, [B, sum n_t^2].
-        joint_terms: What limits and resists joints: rows of the core, one for each coordinate,
+        joint_terms: Limits and resistance of joints: rows of the core, one for each coordinate,
             [B, n, 7]; None if no joint is moved by forces.
         bodies: Details of the dynamic bodies, None if there are none.
         robots: Details of the robots.
-        held_poses: Poses of all bodies, for dynamic ones those at the start, [B, K, 7].
+        held_poses: Poses of all bodies, for dynamic ones at the start, [B, K, 7].
         held_velocities: Velocities of kinematic bodies, zero elsewhere, [B, K, 6].
     """
 
@@ -108,7 +108,7 @@ class Dynamics:
     Attributes:
         dt: Time step [s].
         coordinate_count: n.
-        prescribed: Which coordinates are prescribed, [n].
+        prescribed: Mask of prescribed coordinates, [n].
     """
 
     def __init__(self, assembly: Assembly, dt: float, weight: str | None = None) -> None:
@@ -117,8 +117,8 @@ class Dynamics:
         Args:
             assembly: Arrays of the scene.
             dt: Time step [s].
-            weight: None for steps in time. In steps that lead to an equilibrium, how the weight of
-                robots changes with their configuration: "bounded" (an upper bound, for steps from
+            weight: None for steps in time. For steps to an equilibrium, the dependence of the
+                weight of robots on their configuration: "bounded" (an upper bound, for steps from
                 afar) or "exact" (the derivative).
         """
         self.dt = dt
@@ -136,7 +136,7 @@ class Dynamics:
 
         row = cpu.full((len(mechanisms),), -1, dtype=torch.int64).index_copy(
             0, self._free, cpu.arange(len(self._free))
-        )[owner]  # of a vertex's body among the dynamic ones
+        )[owner]  # index of a vertex's body among the dynamic ones
         self._on_free = torch.nonzero(row >= 0)[:, 0]
         self._body_of_vertex = row[self._on_free]
         self._body_points = vertices[self._on_free]
@@ -172,12 +172,12 @@ class Dynamics:
         Args:
             state: Fields of a state, each with a leading axis B.
             control: Fields of a control, complete, each with a leading axis B or 1.
-            parameters: `gravity`, and the masses, gains and so on that the scene has; with leading
+            parameters: `gravity`, and masses, gains and other parameters of the scene; with leading
                 axes B or 1.
             contact: Forces on the vertices of bodies and links [N] that act over the step like
                 gravity, shape [B, V, 3].
-            joint_origins: Values of all joints from which their friction counts motion, [B, J];
-                those at the start by default.
+            joint_origins: Values of all joints from which their friction measures motion, [B, J];
+                by default the values at the start.
         """
         if _forked and torch.get_num_threads() > 1:
             # Threads of torch and MKL do not survive a fork: an operation would wait for them
@@ -229,7 +229,7 @@ class Dynamics:
 
         Args:
             prediction: Prediction of the step.
-            poses: Poses of all roots at its end, [B, T, 7]; those of free roots are ignored.
+            poses: Poses of all roots at its end, [B, T, 7]; rows of free roots are ignored.
         """
         moved, bodies = self._moved, prediction.held_poses.shape[1]
         start, end = prediction.body_poses[:, :bodies], poses[:, :bodies]
@@ -242,7 +242,7 @@ class Dynamics:
         )
 
     def last_places(self, state: Fields, parameters: Fields) -> Fields:
-        """Positions of bodies and robots one step before the state, by the velocities in it.
+        """Positions of bodies and robots one step before the state, by its velocities.
 
         Prescribed bodies, joints and bases keep their positions.
 
@@ -295,7 +295,7 @@ class Dynamics:
 
         Args:
             prediction: Prediction of this step.
-            coordinates: Coordinates at its end, as the core found them, [B, n].
+            coordinates: Coordinates at its end, from the core, [B, n].
             contact: Forces on the vertices of bodies and links in its solution [N], shape
                 [B, V, 3].
             kick: Further forces on these vertices, which change velocities only.
@@ -342,7 +342,7 @@ class Dynamics:
         }
 
     def too_fast(self, prediction: Prediction) -> dict[int, str]:
-        """Environments in which robots are too fast for a time step -> a sentence about one."""
+        """Environments with robots that are too fast for a time step -> a sentence about one."""
         found: dict[int, str] = {}
         for robot, own in zip(self._robots, prediction.robots, strict=True):
             found |= robot.too_fast(own)
@@ -351,7 +351,7 @@ class Dynamics:
     def turned_too_far(
         self, prediction: Prediction, after: Fields, forces: Tensor
     ) -> dict[int, str]:
-        """Dynamic bodies and robots that turn further in a step than it, or contact, resolves.
+        """Dynamic bodies and robots that turn by more than a step, or contact, resolves.
 
         Args:
             prediction: Prediction of the step.
@@ -383,7 +383,7 @@ class Dynamics:
         return found
 
     def joint_weights(self, state: Fields, parameters: Fields) -> Tensor:
-        """What the weight of dynamic robots exerts at the joints, [B, J] N m or N.
+        """Generalized forces of the weight of dynamic robots at the joints, [B, J] N m or N.
 
         Args:
             state: Fields of a state, each with a leading axis B.
@@ -478,7 +478,7 @@ class Dynamics:
     ) -> RobotPrediction:
         joints, _, vertices = self._robot_rows[i]
         bounds = None
-        if "joint_effort_limits" in parameters:  # as where any joint is moved by forces
+        if "joint_effort_limits" in parameters:  # present if any joint is moved by forces
             bounds = Bounds(
                 efforts=parameters["joint_effort_limits"][:, joints],
                 velocities=parameters["joint_velocity_limits"][:, joints],
@@ -521,7 +521,7 @@ def _indices(values: Iterable[int]) -> Tensor:
 
 
 def _idle_terms(like: Tensor, count: int) -> Tensor:
-    """Rows of joint terms that do nothing, [B, count, 7], for coordinates that are no joints."""
+    """Rows of joint terms without effect, [B, count, 7], for coordinates that are no joints."""
     row = like.new_tensor([0.0, 0.0, 0.0, LARGEST, LARGEST, 0.0, 1.0])
     return row.expand(len(like), count, len(row))
 

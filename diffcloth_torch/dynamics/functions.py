@@ -1,7 +1,7 @@
-"""Functions of bodies and robots over a step, which the core evaluates, as operations of torch.
+"""Functions of bodies and robots over a step, evaluated by the core, as operations of torch.
 
-The core records the operations of an evaluation and goes back along them, so that a gradient takes
-a few evaluations however many inputs there are. There is no second derivative.
+The core records the operations of an evaluation and differentiates them in reverse, so that a
+gradient costs a few evaluations for any number of inputs. There is no second derivative.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from diffcloth_torch.model.robot import ACTUATIONS, BASES
 
 __all__ = ["body_functions", "outputs_of", "robot_functions"]
 
-# Environments that a thread takes; fewer do not pay for it.
+# Environments per thread; fewer would not pay for the thread.
 _EACH = 16
 
 
 @cache
 def body_functions(count: int, dt: float) -> tuple[_core.SmoothFunction, _core.SmoothFunction]:
-    """Prediction of so many free bodies, and their state once the step is solved.
+    """Functions for the prediction of free bodies, and for their state after the step is solved.
 
     Args:
         count: K.
@@ -48,17 +48,17 @@ def robot_functions(
     is_at_rest: bool,
     bounds_weight: bool = False,
 ) -> tuple[_core.SmoothFunction, _core.SmoothFunction]:
-    """Prediction of a robot, and its state once the step is solved.
+    """Functions for the prediction of a robot, and for its state after the step is solved.
 
     Args:
         mechanism: Links and joints of the robot.
         dt: h [s].
         links: Index of the link of each vertex that may be in contact, shape [V].
         points: These vertices, in the frames of their links [m], shape [V, 3].
-        largest: Limits that are none.
-        is_at_rest: Whether steps lead to an equilibrium.
-        bounds_weight: Whether the stiffness of the weight in these is an upper bound, for steps
-            from afar, or exact.
+        largest: Value of limits that do not exist.
+        is_at_rest: True for steps to an equilibrium.
+        bounds_weight: If true, these steps use an upper bound for the stiffness of the weight, for
+            steps from afar; otherwise the exact stiffness.
     """
     return _core.robot_functions(
         tree=core_tree(mechanism),
@@ -74,10 +74,10 @@ def robot_functions(
 
 
 def outputs_of(function: _core.SmoothFunction, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Outputs [B, ...] by their names, with a graph if an input has one.
+    """Return outputs [B, ...] by their names, with a graph if an input has one.
 
     Args:
-        function: What is evaluated.
+        function: The function.
         inputs: Its arrays [B or 1, ...] by their names, without optional ones that are not given.
     """
     note_caller()

@@ -1,4 +1,4 @@
-"""Scales of joints: the stiffness of the barriers at their limits, and their rates of slip."""
+"""Scales of joints: the stiffness of the barriers at their limits, and their slip rates."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ __all__ = ["ZONE", "LimitStiffness", "limit_stiffness", "slip_rates"]
 ZONE = 0.01
 """Share of its range by which a joint may be beyond a limit, and of a limit of its speed."""
 
-# A joint whose whole weight rests on its limit is sqrt(1 / (3 . 30)) = 0.11 of the zone beyond it.
+# A joint whose whole weight rests on its limit is beyond it by sqrt(1 / (3 . 30)) = 0.11 of the
+# zone.
 _WEIGHT_MARGIN = 30.0
 
 
 class LimitStiffness(NamedTuple):
-    """What the barriers at limits are made of, one for each coordinate.
+    """Constants of the barriers at limits, one for each coordinate.
 
     Attributes:
         positions: k of limits of positions [N m/rad^2 or N/m], zero without one; shape [n].
-        velocities: k of limits of speeds, of which the barrier has k + F / w; shape [n].
+        velocities: k of limits of speeds; the stiffness of the barrier is k + F / w; shape [n].
         forces: F [N m or N], shape [n].
     """
 
@@ -46,9 +47,9 @@ def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> Limit
         k = M_jj / h^2 + 30 Q_j / w
 
     a limit is about as stiff as the joint's own inertia, and the joint's weight, a generalized
-    force of at most Q_j, pushes it a tenth of the zone beyond the limit. M and Q are those of the
-    scene at its start, for any direction of gravity. The same holds for a limit of its speed, with
-    the width of the zone as a distance in a step, which is known when the limit is.
+    force of at most Q_j, pushes the joint a tenth of the zone beyond the limit. M and Q are
+    evaluated at the start of the scene, for any direction of gravity. The same holds for a limit of
+    speed, with the width of the zone as a distance in a step, which is known once the limit is.
 
     Args:
         assembly: Arrays of the scene.
@@ -71,10 +72,11 @@ def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> Limit
 
 
 def slip_rates(assembly: Assembly, slip_velocity: float) -> FloatArray:
-    """Speeds of the joints at which they move what they carry by a slip velocity.
+    """Speeds of the joints that move their loads with a slip velocity.
 
-    That is: at its radius of gyration about the joint's axis, sqrt(M_jj / m_j) with the mass m_j
-    that the joint carries; prismatic joints without others that mimic them have the slip velocity.
+    The slip velocity is reached at the load's radius of gyration about the joint's axis, sqrt(M_jj
+    / m_j), with the mass m_j that the joint carries; prismatic joints without others that mimic
+    them have the slip velocity.
 
     Args:
         assembly: Arrays of the scene.
@@ -92,7 +94,7 @@ def slip_rates(assembly: Assembly, slip_velocity: float) -> FloatArray:
 
 
 class _Inertia(NamedTuple):
-    """Of the joints at the start: M_jj, m |dc/dq| summed over the links, and their mass; [J]."""
+    """Values of joints at the start: M_jj, m |dc/dq| summed over the links, and their mass; [J]."""
 
     moments: FloatArray
     pulls: FloatArray
@@ -114,7 +116,7 @@ def _inertias(assembly: Assembly) -> Iterator[tuple[Mechanism, _Inertia]]:
 def _of_joints(mechanism: Mechanism, start: FloatArray, armature: FloatArray) -> _Inertia:
     arrays = (mechanism.mass, mechanism.center, mechanism.inertia)
     mass, center, inertia = (constant(array)[None] for array in arrays)
-    # One joint after the other moves alone, at unit speed.
+    # Each joint in turn moves alone, at unit speed.
     count = mechanism.joint_count
     links, joints = Links(mechanism), constant(start).expand(count, -1)
     root, still = cpu.eye(4).expand(count, 4, 4), cpu.zeros(1, ROOT)

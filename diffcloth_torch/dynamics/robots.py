@@ -1,6 +1,6 @@
-"""A robot over one step: its motion by itself, and its state after the step is solved.
+"""A robot over one step: its free motion, and its state after the step is solved.
 
-**Prediction.** A step without contact, drives and limits is that of the variational integrator with
+**Prediction.** A step without contact, drives and limits follows the variational integrator with
 the discrete Lagrangian h T(q_mid, nu) - h V(q_n): kinetic energy at the middle of the step, with
 constant velocities nu along it. With the momentum p(q, nu) = M nu and the slope s = dT/dq,
 
@@ -8,25 +8,27 @@ constant velocities nu along it. With the momentum p(q, nu) = M nu and the slope
     M(q_n+1) nu_n+1 = p(q_mid, nu) + h/2 s(q_mid, nu),
 
 where tau are gravity, wrenches and efforts. Velocity products are thus implicit, and the scheme is
-symplectic: by itself a robot neither gains nor loses energy in the long run. Iterations that start
-at nu_n and M(q_n) solve the first line. The velocity of a base or joint with prescribed motion is
+symplectic: a free robot neither gains nor loses energy in the long run. Iterations that start at
+nu_n and M(q_n) solve the first line. The velocity of a base or joint with prescribed motion is
 known.
 
 The objective of the core is quadratic about that motion, with the metric M(q_n+1)/h^2. A robot that
-something holds at rest instead would not feel its weight there, but that and velocity products of
-the fall: hundredths of it, of the order of h^2. So M changes a little: see `add_change_at_rest` in
-`csrc/bodies/robot_prediction.cpp`, where all of this is evaluated.
+is held at rest instead would not feel its exact weight, but the weight with the velocity products
+of the fall, a relative error of hundredths, of the order of h^2. M is therefore changed slightly:
+see `add_change_at_rest` in `csrc/bodies/robot_prediction.cpp`, where all these equations are
+evaluated.
 
-**Advance.** After the step the velocities nu over it follow from its two ends, and the second
-line turns them into nu_n+1. A robot that did not move has no velocity, whatever holds it. If motion
-is prescribed, nu_n+1 is nu, and tau lacks an effort tau_c. Both lines together, with the forces f
-of contact, give this effort from the change of momentum:
+**Advance.** After the step the velocities nu over it follow from its two ends, and the second line
+yields nu_n+1. A robot that did not move has no velocity, whatever holds it. If motion is
+prescribed, nu_n+1 is nu, and tau lacks an effort tau_c. Both lines together, with the forces f of
+contact, yield this effort from the change of momentum:
 
     M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
 
-The rows of a floating root are those of the whole robot, without any tau_c: they say what nu_n+1 is
-there, with the f for which the solve moved the root from the prediction. The metric of the solve is
-not M all along the way, and by what it differs the joints would give the robot momentum.
+The rows of a floating root are those of the whole robot, without any tau_c: they determine nu_n+1
+of the root, with the f for which the solve moved the root from the prediction. The metric of the
+solve differs from M along the path, and by this difference the joints would add momentum to the
+robot.
 
 **Drives.** A joint under `pd` adds to the objective, with q_n its value at the start of the step,
 
@@ -35,16 +37,16 @@ not M all along the way, and by what it differs the joints would give the robot 
 so its drive acts at the end of the step, implicitly and without a bound on the gains. Under
 `torque` there is only the last term, the joint's own viscosity.
 
-That is a drive that has whatever effort it asks for. Under a limit L, of an effort a it has only
+Such a drive exerts any effort a that its gains require. With a limit L it exerts only
 
     s(a) = a for |a| <= 0.9 L,    sign(a) (0.9 L + 0.1 L r / sqrt(1 + r^2)) beyond,
 
-with the excess r = (|a| - 0.9 L) / (0.1 L). This has two continuous derivatives, and its slope
-never vanishes. What a drive lacks, a - s(a), is part of the term of a joint, which the solver
+with the excess r = (|a| - 0.9 L) / (0.1 L). This function has two continuous derivatives, and its
+slope never vanishes. The missing effort a - s(a) is part of the term of a joint, which the solver
 evaluates (see csrc/bodies/joint_term.h), as are a limit of the speed and Coulomb friction.
 
-**At rest.** A step that looks for an equilibrium is long, and tau(q_n) would lead far away in it.
-Such a step predicts no motion; it counts tau(q_n) as a force and adds a stiffness of the weight to
+**At rest.** A step to an equilibrium is long, and tau(q_n) would move the robot far away in it.
+Such a step predicts no motion; it treats tau(q_n) as a force and adds a stiffness of the weight to
 M/h^2: see csrc/bodies/weight_stiffness.h.
 """
 
@@ -119,7 +121,7 @@ class Gains(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What each joint can do and what resists it, [B or 1, J].
+    """Limits and resistance of each joint, [B or 1, J].
 
     Attributes:
         efforts: L [N m or N].
@@ -148,9 +150,9 @@ class RobotPrediction(NamedTuple):
         velocity: nu over the step, [B, 6 + J].
         known: nu if it is prescribed, zero elsewhere; [B, 6 + J].
         given: M(q_n) nu_n + h tau(q_n), [B, 6 + J].
-        lost: Which environments have no such motion, as the robot is too fast for the time step: it
-            stays where it is there; [B].
-        inputs: Arrays of the core's function that `advance` has in common with the prediction.
+        lost: Mask of environments without such a motion, as the robot is too fast for the time
+            step; the robot then stays in place; [B].
+        inputs: Arrays that the core's functions of prediction and `advance` share.
     """
 
     root_start: Tensor
@@ -173,7 +175,7 @@ class RobotDynamics:
     Attributes:
         mechanism: Its links and joints.
         coordinate_count: n: six of a floating base, then the J joints.
-        prescribed: Which of the coordinates are prescribed, [n].
+        prescribed: Mask of prescribed coordinates, [n].
         root: The root link.
     """
 
@@ -233,8 +235,8 @@ class RobotDynamics:
             gravity: [B or 1, 3] m/s^2.
             contact: Forces on the vertices that act like the wrenches, [B, V, 3] N.
             bounds: Limits and friction of the joints; None if no joint of the scene can have any.
-            origins: Values of the joints from which friction counts motion, [B, J]; those at the
-                start by default.
+            origins: Values of the joints from which friction measures motion, [B, J]; by default
+                the values at the start.
         """
         inertia = inertia if self._own_inertia is None else self._own_inertia
         shared = {
@@ -293,7 +295,7 @@ class RobotDynamics:
         contact: Tensor,
         kick: Tensor | None = None,
     ) -> tuple[RobotState, Tensor]:
-        """State after a step, and the efforts on the joints [B, J] during it.
+        """Return the state after a step, and the efforts on the joints [B, J] during it.
 
         Args:
             prediction: Prediction of the step.
@@ -319,10 +321,10 @@ class RobotDynamics:
         return after, found["efforts"]
 
     def joint_weights(self, state: RobotState, inertia: Inertia, gravity: Tensor) -> Tensor:
-        """What the weight exerts at the joints, [B, J] N m or N; zero if the robot is not dynamic.
+        """Generalized forces of the weight at the joints, [B, J] N m or N; zero if not dynamic.
 
         Args:
-            state: State of the robot, whose velocities do not matter.
+            state: State of the robot; its velocities are ignored.
             inertia: Masses and inertias of links and joints.
             gravity: [B or 1, 3] m/s^2.
         """
@@ -359,7 +361,7 @@ class RobotDynamics:
     # Constituents
 
     def _acting(self, inertia: Inertia) -> Inertia:
-        """Inertia that counts, which leaves out the drives of prescribed joints.
+        """Inertia that takes part in motion, without the drives of prescribed joints.
 
         Parameters have no masses of robots that are not dynamic.
         """
@@ -368,7 +370,7 @@ class RobotDynamics:
         return inertia._replace(armature=~self._prescribed * inertia.armature)
 
     def too_fast(self, prediction: RobotPrediction) -> dict[int, str]:
-        """Environment without a motion by itself -> a sentence."""
+        """Environments without a free motion -> a sentence."""
         sentence = (
             f"the velocities of robot {self.mechanism.name!r} are too large for a time step of "
             f"{self._dt:g} s; no joint, and no base, may turn by more than half a turn in it"
@@ -379,8 +381,8 @@ class RobotDynamics:
 def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:
     """Inertia for the efforts of prescribed joints of a robot that is not dynamic.
 
-    No joint carries the root link. Without a mass there, the velocities of such a root are those of
-    its frame's origin.
+    No joint carries the root link. Without a mass there, the velocities of such a root refer to its
+    frame's origin.
     """
     center = np.where(
         np.arange(mechanism.link_count)[:, None] == mechanism.root, 0, mechanism.center
@@ -390,7 +392,7 @@ def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:
 
 
 def _placed(pose: Tensor, local: Tensor) -> Tensor:
-    """Pose [.., 7] of a link's center of mass, from that of its frame; its quaternion is unit."""
+    """Pose [.., 7] of a link's center of mass, from its frame's pose; the quaternion is unit."""
     quaternion = torch.nn.functional.normalize(pose[..., 3:], dim=-1)
     center = pose[..., :3] + times(quaternion_matrix(quaternion), local)
     return torch.cat([center, quaternion], dim=-1)

@@ -1,14 +1,13 @@
 """Couplings that solve bodies and cloths one after the other.
 
 Both are accurate if dynamic bodies and robots are much heavier than the cloth that they touch. Each
-side sees the other before or after its motion, so an error of one side passes back and forth; the
-added-mass number
+solve uses the other side before or after its motion, so an error of one side passes back and
+forth; the added-mass number
 
     N = (mass of the cloth in contact + h^2 stiffness of the contact) / mass of the body
 
-is the factor by which it grows or falls each time. A bouncing body gains energy long before this
-number is 1: relative to its force, the barrier is softest at a third of its reach, and stiffer
-elsewhere.
+is the factor of this error each time. A bouncing body gains energy long before this number is 1:
+relative to its force, the barrier is softest at a third of its reach, and stiffer elsewhere.
 """
 
 from __future__ import annotations
@@ -110,16 +109,16 @@ def cloth_to_rigid(
 ) -> StaggeredStep[Cloth, Rigid]:
     """Move the cloth against bodies and robots at rest, then move these by the forces of the cloth.
 
-    Friction sees them move as in the step before.
+    In friction, bodies and robots move as in the step before.
 
     Args:
         dynamics: Dynamics of the bodies and robots.
         predict: Predicts the step, with forces [B, V, 3] that act on the vertices.
-        origins: Positions of all vertices from which friction counts motion, [B, N + V, 3] m.
+        origins: Positions of all vertices from which friction measures motion, [B, N + V, 3] m.
         solve_rigid: As for `rigid_to_cloth`.
         solve_cloth: Likewise, with those origins.
-        check_path: Raises if bodies and robots, moving straight between two rows of coordinates of
-            the prediction, collide with the solved cloth.
+        check_path: Raises an error if bodies and robots, moving straight between two rows of
+            coordinates of the prediction, collide with the solved cloth.
     """
     still = predict(None)
     held = torch.where(dynamics.prescribed, still.coordinate_ends, still.coordinates)
@@ -144,14 +143,14 @@ def added_mass_numbers(
 ) -> Tensor:
     """Estimate the added-mass number of each body and link.
 
-    The cloth in contact is the cloth inside the surface's bounding box, which is taken in the frame
-    of the surface and enlarged by the reach. The stiffness of the contact is the least that its
-    force allows: three times that force over the reach.
+    The cloth in contact is the cloth inside the surface's bounding box in the frame of the surface,
+    enlarged by the reach. The stiffness of the contact is the smallest one that its force allows:
+    three times that force over the reach.
 
     Args:
         assembly: Arrays of the scene.
         frames: Frames of the K + Lc surfaces after the cloths, [B, K + Lc, 4, 4].
-        masses: Mass of each of them, zero if it is prescribed, [B or 1, K + Lc] kg.
+        masses: Mass of each surface, zero if it is prescribed, [B or 1, K + Lc] kg.
         positions: Positions of the cloths' vertices, [B, N, 3] m.
         vertex_masses: Masses of these vertices, [B or 1, N] kg.
         forces: Forces of the cloth on the surfaces' vertices, [B, V, 3] N.

@@ -1,4 +1,4 @@
-"""Momentum and energy of all that moves in a scene: sums over points, bodies and links."""
+"""Momentum and energy of all moving objects in a scene: sums over points, bodies and links."""
 
 from __future__ import annotations
 

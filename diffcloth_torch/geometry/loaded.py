@@ -1,4 +1,4 @@
-"""Meshes of files in meters: polygons cut, vertices merged, and remarks on their size."""
+"""Meshes of files in meters: polygons cut, vertices merged, and warnings about their size."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from diffcloth_torch.geometry.polygons import welded
 
 __all__ = ["LoadedMesh", "load_mesh"]
 
-# Usual sizes of cloths and bodies [m]: other ones are most often in another unit.
+# Usual sizes of cloths and bodies [m]: other sizes are most often in another unit.
 _LONGEST, _SHORTEST = 10.0, 1e-3
 
 
@@ -36,9 +36,9 @@ class LoadedMesh(NamedTuple):
     Attributes:
         vertices: Vertices [m], [n, 3].
         faces: Triangles, [f, 3].
-        texture: Texture coordinates of the corners of the faces, [f, 3, 2], NaN where there are
-            none; None where the format has none.
-        file_vertices: Vertex that stands for each vertex of the file, [m].
+        texture: Texture coordinates of the corners of the faces, [f, 3, 2], NaN for corners without
+            any; None if the format has none.
+        file_vertices: Index of the merged vertex for each vertex of the file, [m].
     """
 
     vertices: FloatArray
@@ -50,7 +50,7 @@ class LoadedMesh(NamedTuple):
         """Vertices [n, 3] in the plane of the texture coordinates.
 
         Args:
-            owner: Opens messages.
+            owner: Prefix of messages.
             scale: Meters per unit of the texture coordinates.
 
         Raises:
@@ -101,10 +101,10 @@ def load_mesh(
     """Read a mesh; warn if it is longer than 10 m or shorter than 1 mm.
 
     Args:
-        owner: Opens messages.
+        owner: Prefix of messages.
         path: Mesh file.
         scale: Meters per unit of the file, > 0.
-        triangulate: Whether to cut polygons into triangles.
+        triangulate: If true, cut polygons into triangles.
         weld: Distance [m] up to which vertices are merged; None merges none.
         instead: Remedy in the message about a scale that requires a gradient.
         read: Reader of the file: `read_file_mesh` or `read_body_mesh`.

@@ -9,16 +9,16 @@ from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["check_inertia", "check_part_of_inertia", "is_closed", "mass_properties"]
 
-# Relative to the largest entry or moment: decimals that a file or a user has rounded.
+# Relative to the largest entry or moment: allows for rounded decimals of a file or a user.
 _ROUNDING = 1e-6
 
-# Smallest over largest principal moment. A rod of 1 m by 1 mm has 1e-6; below this, rounding alone
-# decides how fast a body spins.
+# Smallest over largest principal moment. A rod of 1 m by 1 mm has 1e-6; below this ratio, rounding
+# alone determines the spin of a body.
 _SMALLEST_MOMENT = 1e-12
 
 
 def is_closed(faces: IndexArray) -> bool:
-    """Whether faces traverse each edge equally often in both directions."""
+    """Return whether faces traverse each edge equally often in both directions."""
     a, b = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     edges, inverse = np.unique(
         np.stack([np.minimum(a, b), np.maximum(a, b)], axis=-1), axis=0, return_inverse=True
@@ -64,7 +64,7 @@ def mass_properties(
 
 
 def check_inertia(name: str, inertia: FloatArray) -> FloatArray:
-    """Require a symmetric inertia [3, 3] that a body can have; returns its symmetric part.
+    """Require a possible symmetric inertia [3, 3] of a body; return its symmetric part.
 
     Its principal moments are positive, and none is larger than the sum of the others.
     """
@@ -91,7 +91,7 @@ def check_inertia(name: str, inertia: FloatArray) -> FloatArray:
 
 
 def check_part_of_inertia(name: str, inertia: FloatArray) -> None:
-    """Require a symmetric inertia [3, 3] that a part of a body can have, such as a point's."""
+    """Require a possible symmetric inertia [3, 3] of a part of a body, such as a point's."""
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] < -_SMALLEST_MOMENT * abs(moments[2]):
         text = ", ".join(f"{moment:g}" for moment in moments)

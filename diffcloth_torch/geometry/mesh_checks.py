@@ -40,8 +40,8 @@ class Surface(NamedTuple):
     faces: IndexArray
 
 
-# Twice the area of a face over its longest edge squared. Below this, rounding decides which way
-# the normal points.
+# Twice the area of a face over its longest edge squared. Below this ratio, rounding determines the
+# direction of the normal.
 _FLATTEST_FACE = 1e-12
 
 
@@ -50,9 +50,9 @@ class BodySurface(NamedTuple):
 
     Attributes:
         vertices: Positions [m], shape [n, 3].
-        faces: Triangles that contact takes, shape [f, 3].
-        solid: Triangles that enclose the body, where the mesh is closed, shape [s, 3]: those
-            without area close it, and so do two faces that face each other.
+        faces: Triangles for contact, shape [f, 3].
+        solid: Triangles that enclose the body if the mesh is closed, shape [s, 3], including faces
+            without area and opposite faces, which close it.
     """
 
     vertices: FloatArray
@@ -63,7 +63,7 @@ class BodySurface(NamedTuple):
 def surface_arrays(
     owner: str, vertices: object, faces: object, *, instead: str
 ) -> tuple[FloatArray, IndexArray]:
-    """Check vertices [n, 3] and triangles [f, 3]; returns read-only copies."""
+    """Check vertices [n, 3] and triangles [f, 3]; return read-only copies."""
     points, triangles = _arrays(owner, vertices, faces, instead=instead)
     _check_distinct(owner, triangles)
     check_areas(owner, "vertices", points, triangles)
@@ -71,17 +71,17 @@ def surface_arrays(
 
 
 def body_arrays(owner: str, vertices: object, faces: object, *, instead: str) -> BodySurface:
-    """Check vertices [n, 3] and triangles [f, 3] of a body; returns read-only copies.
+    """Check vertices [n, 3] and triangles [f, 3] of a body; return read-only copies.
 
-    Faces without area and all but one of those with the same vertices are dropped, with a warning
-    that counts them: they bear no contact, or that of another face.
+    Faces without area, and all but one of the faces with the same vertices, are dropped with a
+    warning that counts them: they bear no contact, or duplicate the contact of another face.
     """
     points, triangles = _arrays(owner, vertices, faces, instead=instead)
     _check_sides(owner, "vertices", points, triangles)
     flat = _is_flat(points, triangles)
     ordered = np.sort(triangles, axis=1)
     doubled = _repeats(ordered) & ~flat
-    # In the direction of the face, from its smallest vertex on.
+    # In the direction of the face, beginning with its smallest vertex.
     turned = np.take_along_axis(
         triangles, (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1
     )
@@ -113,14 +113,14 @@ def _arrays(
 
 
 def _repeats(rows: IndexArray) -> NDArray[np.bool_]:
-    """Whether each row is equal to one before it, [n]."""
+    """Return whether each row is equal to a previous one, [n]."""
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     repeats: NDArray[np.bool_] = first[inverse.reshape(-1)] != np.arange(len(rows))
     return repeats
 
 
 def warn_of_cuts(owner: str, vertices: FloatArray, faces: IndexArray) -> None:
-    """Warn of an edge whose two faces have vertices of their own at the same places."""
+    """Warn of an edge whose two faces have separate vertices at equal positions."""
     places, inverse = np.unique(vertices, axis=0, return_inverse=True)
     if len(places) == len(vertices):
         return
@@ -161,7 +161,7 @@ def _check_distinct(owner: str, faces: IndexArray) -> None:
 
 
 def check_areas(owner: str, field: str, vertices: FloatArray, faces: IndexArray) -> None:
-    """Refuse faces of zero area, and those whose area is lost in the range of float64."""
+    """Refuse faces of zero area, and faces whose area is lost in the range of float64."""
     _check_sides(owner, field, vertices, faces)
     flat = np.flatnonzero(_is_flat(vertices, faces))
     if flat.size:
@@ -190,7 +190,7 @@ def _longest_sq(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def _is_flat(vertices: FloatArray, faces: IndexArray) -> NDArray[np.bool_]:
-    """Which faces have no area."""
+    """Return a mask of faces without area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     is_flat: NDArray[np.bool_] = double_area <= _FLATTEST_FACE * _longest_sq(vertices, faces)

@@ -32,7 +32,7 @@ __all__ = [
     "write_mesh",
 ]
 
-# Far beyond what a step can take; a larger file is a mistake, refused before it fills the memory.
+# Far larger than any mesh that a step can handle; refused before it fills the memory.
 _LARGEST_FILE = 1 << 30
 
 Indices = NDArray[np.int64]
@@ -41,13 +41,13 @@ MeshPart = tuple[str, FloatArray, NDArray[np.integer]]
 
 
 class FileMesh(NamedTuple):
-    """A mesh as its file has it.
+    """A mesh in the units and order of its file.
 
     Attributes:
         vertices: Vertices in units of the file, [n, 3].
         faces: Triangles, [f, 3].
-        texture: Texture coordinates (u, v) of the corners of the faces, [f, 3, 2]; NaN where a
-            corner has none, None where the format has none.
+        texture: Texture coordinates (u, v) of the corners of the faces, [f, 3, 2]; NaN for corners
+            without any, None if the format has none.
     """
 
     vertices: FloatArray
@@ -64,7 +64,7 @@ def read_mesh(path: str | Path, name: str = "read_mesh: `path`") -> tuple[FloatA
 
     Args:
         path: The file.
-        name: Opens messages about the path; those about the content of the file open with it.
+        name: Prefix of messages about the path; messages about the content begin with the path.
 
     Raises:
         InvalidInput: If the file is empty, malformed, of another format, larger than 1 GiB or not a
@@ -82,8 +82,8 @@ def read_file_mesh(path: str | Path, name: str, *, triangulate: bool = False) ->
 
     Args:
         path: The file.
-        name: Opens messages about the path.
-        triangulate: Whether to cut polygons into triangles instead of refusing them.
+        name: Prefix of messages about the path.
+        triangulate: If true, cut polygons into triangles instead of refusing them.
     """
     return _read(path, name, _readers(), triangulate)
 
@@ -91,18 +91,18 @@ def read_file_mesh(path: str | Path, name: str, *, triangulate: bool = False) ->
 def read_body_mesh(path: str | Path, name: str, *, triangulate: bool = True) -> FileMesh:
     """Read the mesh of a rigid body.
 
-    Besides the files of `read_mesh`, .dae, .glb and .gltf files are read, all parts of which become
-    one mesh.
+    In addition to the files of `read_mesh`, .dae, .glb and .gltf files are read; all of their parts
+    become one mesh.
 
     Args:
         path: The file.
-        name: Opens messages about the path.
-        triangulate: Whether to cut polygons into triangles instead of refusing them.
+        name: Prefix of messages about the path.
+        triangulate: If true, cut polygons into triangles instead of refusing them.
 
     Raises:
-        InvalidInput: As for `read_mesh`; if a polygon has no area or crosses itself; if polygons of
-            a .dae file are not to be cut; or if the file needs a package of the extra `robots` that
-            is not installed.
+        InvalidInput: As for `read_mesh`; if a polygon has no area or crosses itself; if a .dae file
+            has polygons and `triangulate` is false; or if the file needs a package of the extra
+            `robots` that is not installed.
         TypeError: If `path` is not a path.
         OSError: If the file cannot be read.
     """
@@ -137,7 +137,7 @@ def _read(
 
 
 def write_mesh(path: str | Path, parts: Sequence[MeshPart]) -> None:
-    """Write named surfaces, in their order, to an .obj or .ply file; numbers survive exactly."""
+    """Write named surfaces, in their order, to an .obj or .ply file; numbers are exact."""
     path = as_path("export: `path`", path)
     suffix = path.suffix.lower()
     if suffix == ".obj":
@@ -152,7 +152,7 @@ def _read_obj(path: Path, data: bytes, triangulate: bool) -> FileMesh:
     vertices: list[list[float]] = []
     textures: list[list[float]] = []
     polygons: list[list[int]] = []
-    corners: list[int] = []  # of texture, of all polygons; -1: none
+    corners: list[int] = []  # texture coordinates of the corners of all polygons; -1: none
     for number, line in _obj_lines(data.removeprefix(b"\xef\xbb\xbf")):
         keyword, *words = line.split() or [b""]
         try:
@@ -186,17 +186,17 @@ def _read_ply(path: Path, data: bytes, triangulate: bool) -> FileMesh:
 def _cut(
     path: Path, vertices: FloatArray, polygons: Sequence[Sequence[int]]
 ) -> tuple[Indices, Indices]:
-    """Triangles [f, 3] of polygons, and the place of their corners in all polygons, [f, 3]."""
+    """Triangles [f, 3] of polygons, and the index of their corners in all polygons, [f, 3]."""
     at_corners = triangulated(str(path), vertices, polygons)
     joined = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
     return joined[at_corners], at_corners
 
 
 def _obj_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Lines without their comments, each with its number; a backslash joins it with the next."""
+    """Lines without their comments, each with its number; a backslash joins a line to the next."""
     parts: list[bytes] = []
     first = 1
-    # Not splitlines() of text: it ends lines at other characters too, as in the midst of a comment.
+    # splitlines() of text would also split at other characters, for example inside of a comment.
     for number, line in enumerate(re.split(rb"\r\n|\n|\r", data), start=1):
         text = line.partition(b"#")[0]
         if not parts:
@@ -220,9 +220,9 @@ def _obj_numbers(words: Sequence[bytes], what: str, numbers: str, count: int) ->
 
 
 def _obj_texture(words: Sequence[bytes]) -> list[float]:
-    """Coordinates u and v; v is 0 by default, and NaN where a file has no numbers."""
+    """Coordinates u and v; v is 0 by default, and NaN if a file has no numbers."""
     if not words or not all(NUMBER.fullmatch(word) for word in words[:2]):
-        return [float("nan"), float("nan")]  # only what wants texture coordinates refuses them
+        return [float("nan"), float("nan")]  # refused only if texture coordinates are needed
     return [float(words[0]), float(words[1]) if len(words) > 1 else 0.0]
 
 
@@ -232,7 +232,7 @@ def _obj_face(
     """Corners of `f a b c`, each `v`, `v/vt`, `v//vn` or `v/vt/vn`; negative: from the end.
 
     Returns:
-        Indices of the vertices, and of the texture coordinates, -1 where there are none.
+        Indices of the vertices, and of the texture coordinates, -1 if there are none.
     """
     if len(words) < 3 or (len(words) > 3 and not triangulate):
         raise ValueError(
@@ -257,7 +257,7 @@ def _obj_face(
 
 
 def _obj_texture_index(text: bytes, count: int) -> int:
-    """Index of texture coordinates; -1 where a corner has none that were read so far."""
+    """Index of texture coordinates; -1 if a corner has none that were read so far."""
     if not INTEGER.fullmatch(text):
         return -1
     index = int(text)

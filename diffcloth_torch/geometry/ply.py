@@ -39,7 +39,7 @@ Columns = dict[str, NDArray[Any]]
 class _Property(NamedTuple):
     name: str
     type: str
-    count_type: str | None  # of a list; None for a single number
+    count_type: str | None  # type of the count of a list; None for a single number
 
 
 class _Element(NamedTuple):
@@ -56,7 +56,7 @@ def read_ply(
     Args:
         path: File, for messages.
         data: Content of the file.
-        triangulate: Whether to return faces as lists of three or more corners instead.
+        triangulate: If true, return faces as lists of three or more corners.
 
     Raises:
         InvalidInput: If the file is malformed, or has polygons other than triangles or an index of
@@ -81,7 +81,7 @@ def read_ply(
             else:
                 faces = corners.astype(np.int64).reshape(-1, 3)
         if vertices.size and len(faces):
-            break  # what follows (edges, materials) is of no interest and may hold any list
+            break  # later elements (edges, materials) are not needed and may hold any list
     _check_corners(path, faces, len(vertices))
     return vertices, faces
 
@@ -121,7 +121,7 @@ def write_ply(path: Path, vertices: FloatArray, faces: NDArray[np.int32]) -> Non
 
 
 def _header_lines(path: Path, data: bytes) -> Iterator[tuple[str, int]]:
-    """Lines of the header, each with the place behind it."""
+    """Lines of the header, each with the offset of the next line."""
     start = 0
     while (end := data.find(b"\n", start)) >= 0:
         yield data[start:end].decode("ascii", errors="replace").rstrip("\r"), end + 1
@@ -175,7 +175,7 @@ def _check_elements(path: Path, elements: list[_Element], body: bytes) -> None:
         names = [column.name for column in element.properties]
         if [e.name for e in elements].count(element.name) > 1 or len(set(names)) < len(names):
             raise InvalidInput(f"{path}: the header names {element.name!r} or a part of it twice")
-        # Every row takes at least a byte: more of them are refused before they are allocated.
+        # Every row has at least one byte: an excess of rows is refused before they are allocated.
         if element.rows > len(body):
             raise InvalidInput(
                 f"{path}: the header says {element.rows} x {element.name!r}, "
@@ -259,7 +259,7 @@ class _Ascii:
 
 
 def _columns(columns: dict[str, list[Any]]) -> Columns:
-    """Arrays of values; of lists where polygons have different numbers of corners."""
+    """Arrays of values; lists if polygons have different numbers of corners."""
     return {
         name: np.array(values, dtype=object if _is_ragged(values) else None)
         for name, values in columns.items()
@@ -289,7 +289,7 @@ class _Binary:
         self._at = 0
 
     def read(self, element: _Element) -> Columns:
-        """Read rows; of different sizes only where they hold polygons."""
+        """Read rows; rows of different sizes are allowed only for polygons."""
         if element.name == "face" and self._triangulate:
             return self._read_row_by_row(element)
         return self._read_table(element)
@@ -317,10 +317,10 @@ class _Binary:
         return entries
 
     def _read_table(self, element: _Element) -> Columns:
-        """Read rows of equal size, which they are when each list is as long as in the first row."""
+        """Read rows of equal size, as when each list is as long as in the first row."""
         if element.rows == 0 or not element.properties:
             return {p.name: np.empty(0) for p in element.properties}
-        # Fields go by their place: a property may have any name.
+        # Fields are addressed by position: a property may have any name.
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         offset = self._at
         for i, column in enumerate(element.properties):

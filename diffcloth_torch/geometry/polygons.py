@@ -21,11 +21,11 @@ def triangulated(path: str, vertices: FloatArray, polygons: Sequence[Sequence[in
     """Cut polygons into triangles, with ears of the shortest diagonals first.
 
     A quad is cut along its shorter diagonal, unless it has a corner that points inwards. Triangles
-    turn as their polygon, and stay in its order. A corner at the place of the one before gets a
-    triangle without area.
+    have the orientation of their polygon, and stay in its order. A corner at the position of the
+    previous one yields a triangle without area.
 
     Args:
-        path: Opens messages.
+        path: Prefix of messages.
         vertices: Vertices [n, 3].
         polygons: Indices of the corners of each.
 
@@ -64,7 +64,7 @@ def _ears(points: FloatArray) -> list[tuple[int, int, int]]:
             if not _is_ear(flat, a, b, c, left):
                 continue
             length = float(np.linalg.norm(points[c] - points[a]))
-            # The first one of diagonals that are equally long, to rounding.
+            # The first one among diagonals of equal length up to rounding.
             if best is None or length < best[0] * (1 - 1e-9):
                 best = length, i
         if best is None:
@@ -117,15 +117,15 @@ def _turn(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
 
 
 def welded(vertices: FloatArray, distance: float) -> tuple[FloatArray, Indices]:
-    """Merge vertices that are no farther apart than a distance, also by way of others.
+    """Merge vertices that are no farther apart than a distance, also through intermediate ones.
 
     Args:
         vertices: Vertices [n, 3].
         distance: The distance [m], >= 0.
 
     Returns:
-        The vertices that are left, each at the place of the first of those that it stands for, in
-        the order of these; and the index of the vertex that stands for each given one, shape [n].
+        The remaining vertices, in the order of the given ones, each at the position of the first
+        vertex that it replaces; and for each given vertex the index of its replacement, shape [n].
     """
     order = np.argsort(vertices[:, 0], kind="stable")
     x = vertices[order]
@@ -134,7 +134,7 @@ def welded(vertices: FloatArray, distance: float) -> tuple[FloatArray, Indices]:
     while step < len(x):
         near = np.flatnonzero(x[step:, 0] - x[:-step, 0] <= distance)
         if not near.size:
-            break  # sorted: vertices that are farther apart in the order are no nearer
+            break  # sorted: vertices farther apart in the order are no nearer
         apart = np.linalg.norm(x[near + step] - x[near], axis=1)
         for i in near[apart <= distance]:
             _join(group, int(order[i]), int(order[i + step]))
@@ -153,4 +153,4 @@ def _root(group: Indices, i: int) -> int:
 
 def _join(group: Indices, i: int, j: int) -> None:
     a, b = sorted((_root(group, i), _root(group, j)))
-    group[b] = a  # the first one stands for all
+    group[b] = a  # the first one replaces all

@@ -21,7 +21,7 @@ __all__ = [
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
-# A quaternion shorter than this is taken for an uninitialized row, not for a rotation.
+# A shorter quaternion is assumed to be an uninitialized row, not a rotation.
 SHORTEST_QUATERNION = 1e-6
 
 

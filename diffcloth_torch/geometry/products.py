@@ -9,16 +9,16 @@ from torch import Tensor, cat, split
 
 __all__ = ["product"]
 
-# From more on torch shares an operation among its threads, which do not outlive a fork.
+# From this size on torch shares an operation among its threads, which do not survive a fork.
 _MOST_NUMBERS = 2**15 - 1
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """A B, [.., m, n], from A [.., m, k] and B [.., k, n] with as many leading axes, or none.
+    """A B, [.., m, n], from A [.., m, k] and B [.., k, n] with equal leading axes, or none.
 
     `matmul` would start threads, and its rounding depends on the number of matrices, on their
-    memory layout and on whether one requires a gradient. Here each number is a sum of its own, and
-    no operation is large.
+    memory layout and on `requires_grad`. Here each number is a separate sum, and no operation is
+    large.
     """
     shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     rows = math.prod(a.shape[-2:]) * b.shape[-1] * math.prod(shape[1:])
@@ -35,7 +35,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
-    # The order of a sum depends on strides too.
+    # The order of a sum also depends on strides.
     terms = a.contiguous().unsqueeze(-1) * b.contiguous().unsqueeze(-3)
     total: Tensor = terms.sum(-2)
     return total

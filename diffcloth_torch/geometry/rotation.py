@@ -30,17 +30,17 @@ __all__ = [
 # 0.1^10 / (2^10 10!) = 3e-20 for the cosine and less for the sine.
 _SERIES_ANGLE = 0.1
 
-# Of (a/2)^2 to the powers of 1 to 4: in cos(a/2) - 1, and in sin(a/2) / (a/2) - 1.
+# Coefficients of (a/2)^2 to the powers 1 to 4 in cos(a/2) - 1, and in sin(a/2) / (a/2) - 1.
 _SERIES = cpu.tensor(
     [[(-1) ** k / math.factorial(2 * k + i) for k in range(1, 5)] for i in range(2)],
 )
 
-# sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
+# sin(a / 2) below which a logarithm uses a / sin(a / 2) = 2, exact to rounding.
 _SMALLEST_SINE = 1e-9
 
 
 # The entries of a rotation matrix are twice a product of two entries of its quaternion plus or
-# minus another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
+# minus another one, minus one on the diagonal; products of (w, x, y, z) are numbered row by row.
 _FIRST = cpu.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0], dtype=torch.int64)
 _SECOND = cpu.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15], dtype=torch.int64)
 _SIGN = cpu.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1])
@@ -61,7 +61,7 @@ def quaternion_exp(rotation_vector: Tensor) -> Tensor:
     """
     angle_sq = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
     near_zero = angle_sq < _SERIES_ANGLE**2
-    # Both branches are evaluated: each gets an argument at which it and its gradient are finite.
+    # Both branches are evaluated: the arguments of each keep value and gradient finite.
     half = torch.where(near_zero, 4.0, angle_sq).sqrt() / 2
     s = torch.where(near_zero, angle_sq, 0.0) / 4
     s_sq = s * s
@@ -114,7 +114,7 @@ def rotate(quaternion: Tensor, points: Tensor) -> Tensor:
 def integrate_poses(pose: Tensor, twists: Tensor, dt: float) -> Tensor:
     """Poses along a sequence of velocities.
 
-    Over each step p <- p + dt v and q <- exp(dt w) q, exact for a w that is constant over it.
+    In each step p <- p + dt v and q <- exp(dt w) q, which is exact for a constant w.
 
     Args:
         pose: Pose before the first step, its quaternion of unit length; shape [7].
@@ -141,7 +141,7 @@ def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
     Args:
         start: Poses with quaternions of any length, shape [..., 7].
         end: Poses, rotated by less than pi relative to `start`; shape [..., 7].
-        dt: Time between them [s].
+        dt: Time between both [s].
 
     Returns:
         Linear velocities [m/s] and angular velocities [rad/s] in world axes, shape [..., 6].
@@ -162,7 +162,7 @@ def row_velocities(start: Tensor, end: Tensor, rows: Tensor, dt: float) -> Tenso
         start: Poses, shape [B, K, 7].
         end: Poses, shape [B, K, 7]; `start` or `end` may have one environment for all.
         rows: Indices of the rows that move.
-        dt: Time between them [s].
+        dt: Time between both [s].
 
     Returns:
         Shape [B, K, 6].
@@ -200,11 +200,11 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
 def quaternion_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
     products = (quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)).flatten(-2)
-    # Not as a product of matrices, whose bits would depend on how many there are.
+    # Not computed by a product of matrices, whose bits would depend on their number.
     sums = products.index_select(-1, _FIRST) + _SIGN * products.index_select(-1, _SECOND)
     return (2 * sums - _IDENTITY).reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def rotation_exp(rotation_vector: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] [rad], smooth at zero too."""
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] [rad], smooth also at zero."""
     return quaternion_matrix(quaternion_exp(rotation_vector))

@@ -1,4 +1,4 @@
-"""Mesh files that trimesh reads: STL, COLLADA and glTF. Vertices at the same place are merged.
+"""Mesh files read by trimesh: STL, COLLADA and glTF. Vertices at equal positions are merged.
 
 STL files have no indices, and the others have a vertex for each normal and color of a corner.
 """
@@ -45,13 +45,13 @@ def read_stl(path: Path, data: bytes) -> Mesh:
 def _read_collada(path: Path, data: bytes) -> Mesh:
     """Read all triangles and polygons of a COLLADA file, in meters.
 
-    The unit of the file applies, its up axis does not: so do RViz and Pinocchio.
+    The unit of the file is applied, its up axis is ignored, as in RViz and Pinocchio.
     """
     from_extra("collada", "robots", f"{path}: COLLADA files need pycollada", _INSTEAD)
     return _read_scene(path, _meshes_alone(path, data), "COLLADA", ignore_broken=False)
 
 
-# Elements whose faults, such as a missing texture or camera, leave the meshes as they are.
+# Elements whose errors, such as a missing texture or camera, do not affect the meshes.
 _BESIDE_MESHES = (
     *("library_effects", "library_images", "library_materials", "bind_material"),
     *("library_cameras", "instance_camera", "library_lights", "instance_light"),
@@ -68,7 +68,7 @@ def _meshes_alone(path: Path, data: bytes) -> bytes:
         raise InvalidInput(
             f"{path}: a COLLADA file must have no DOCTYPE and no entities of its own: {error}"
         ) from error
-    except (ParseError, ValueError, LookupError) as error:  # the latter: encodings
+    except (ParseError, ValueError, LookupError) as error:  # a LookupError: encodings
         raise InvalidInput(f"{path}: not well-formed XML: {error}") from error
     for element in list(document.iter()):
         for child in list(element):
@@ -78,7 +78,7 @@ def _meshes_alone(path: Path, data: bytes) -> bytes:
 
 
 def _read_gltf(path: Path, data: bytes) -> Mesh:
-    """Read all triangles of a glTF file as they stand in it, whichever axis is up."""
+    """Read all triangles of a glTF file in its own axes, for any up axis."""
     return _read_scene(path, data, "glTF", skip_materials=True)
 
 

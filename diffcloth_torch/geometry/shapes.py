@@ -15,9 +15,9 @@ __all__ = ["MOST_FACES", "Mesh", "box", "capsule", "cylinder", "grid", "plane", 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 
 MOST_FACES = 4_000_000
-"""Of a generated mesh: more than any step could take, and refused before they take the memory."""
+"""Largest number of faces of a generated mesh: more are refused before they fill the memory."""
 
-# Segments around a capsule and rings on each of its caps: 5 degrees off a true circle at most.
+# Segments around a capsule and rings on each of its caps: at most 5 degrees off a true circle.
 _CAPSULE_RINGS = 8
 
 # Rings on an end of a cylinder: 6 vertices on the first, 6 more on each next, 30 on its rim.
@@ -52,8 +52,8 @@ def strip(
 
     Args:
         length: Length of the strip [m].
-        width: Width of the strip [m]; one number, or one for each end, with straight sides between
-            them.
+        width: Width of the strip [m]; one number, or one for each end, with straight sides in
+            between.
         rows: Number of vertices across.
         columns: Number of vertices along.
         bend: Angle between the directions of its two ends [degrees], 0 to 180.
@@ -73,7 +73,7 @@ def strip(
     along = np.linspace(0, length, columns)
     ends = np.broadcast_to(width, 2)
     flat[:, 1] *= np.tile(np.interp(along, [0, length], ends), rows)
-    # Each cell is turned like the middle of its arc, so that it keeps its length.
+    # Each cell has the direction of the middle of its arc, so that its length is preserved.
     cells = (along[1:] + along[:-1]) / 2 - middle * length
     turned = np.clip(cells / radius, -np.radians(bend) / 2, np.radians(bend) / 2)
     steps = np.diff(along) * np.stack([np.cos(turned), -np.sin(turned)])
@@ -200,8 +200,7 @@ def cylinder(radius: float, length: float, rings: int = _CYLINDER_RINGS, rows: i
         radius: Radius [m].
         length: Length [m].
         rings: Rings on each end, around its center; six times as many segments on its rim.
-        rows: Rows of quadrilaterals along its side; 0 makes them no longer than the radius, with at
-            most 32 rows.
+        rows: Rows of quadrilaterals along its side; 0: rows no longer than the radius, at most 32.
     """
     rows = rows or int(np.ceil(min(length / radius, _CYLINDER_ROWS)))
     disk, disk_faces = _disk(rings)
@@ -211,7 +210,7 @@ def cylinder(radius: float, length: float, rings: int = _CYLINDER_RINGS, rows: i
     bottom = np.column_stack([disk, np.full(len(disk), -length / 2)])
     heights = np.linspace(length / 2, -length / 2, rows + 1)[1:-1]
     side = [np.column_stack([disk[-rim:], np.full(rim, z)]) for z in heights]
-    # First vertices of the rings along the side, from the rim of the top to that of the bottom.
+    # First vertices of the rings along the side, from the rim of the top to the rim of the bottom.
     n = len(disk)
     starts = [n - rim, *(2 * n + rim * np.arange(rows - 1)).tolist(), 2 * n - rim]
     here = np.arange(rim)

@@ -1,4 +1,4 @@
-"""Robots that come with the package, or with a package of its own: paths for `Robot.load`.
+"""Robots of the package, or of optional packages: paths for `Robot.load`.
 
 `GRIPPER` is a palm with two fingers that slide towards each other; on a floating or kinematic base
 it has eight degrees of freedom. `panda()` finds the Franka Emika Panda in the extra `robots`.
@@ -12,7 +12,7 @@ from pathlib import Path
 __all__ = ["GRIPPER", "panda"]
 
 GRIPPER = Path(__file__).with_name("gripper.urdf")
-"""Made by scripts/make_gripper.py, which says its sizes."""
+"""Written by scripts/make_gripper.py, which defines its sizes."""
 
 _PANDA = "robots/panda_description/urdf/panda.urdf"
 
@@ -22,7 +22,7 @@ def __dir__() -> list[str]:
 
 
 def panda() -> tuple[Path, Path]:
-    """Find the Panda: its URDF file, and the `mesh_root` to load it with.
+    """Return the URDF file of the Panda, and the `mesh_root` with which to load it.
 
     With all joints as near to zero as their limits allow, its fingers touch; this start is open:
 

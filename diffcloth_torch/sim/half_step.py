@@ -1,4 +1,4 @@
-"""Velocities of the second-order step, which are those half a step before the positions."""
+"""Velocities of the second-order step, which are half a step before the positions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["at_half_step", "remember", "with_half_step_velocities"]
 
 
 class Simulator(Protocol):
-    """The part of a simulator that takes a step."""
+    """The part of a simulator that computes a step."""
 
     integrator: str
 
@@ -24,7 +24,7 @@ class Simulator(Protocol):
     ) -> State: ...
 
 
-# The simulator that states with these surfaces come from, while it lives.
+# Simulator of the states with these surfaces, as long as it lives.
 _SIMULATORS: weakref.WeakKeyDictionary[Surfaces, weakref.ref[Simulator]] = (
     weakref.WeakKeyDictionary()
 )
@@ -43,23 +43,23 @@ def at_half_step(
     *,
     simulator: Simulator | None = None,
 ) -> State:
-    """Convert velocities at the time of a state to those that a second-order step starts from.
+    """Convert velocities at the time of a state to the velocities of a second-order step.
 
-    Simulators with `integrator="second_order"` take the velocities of cloths half a time step
-    before the positions. Velocities that are given at the same time as the positions change to
+    Simulators with `integrator="second_order"` use velocities of cloths half a time step before the
+    positions. Velocities at the time of the positions change to
 
         v - (h / 2) a,    a = (v' - v) / h,
 
-    v' those after one step. States that `initial_state`, `step` and `rollout` return need no
-    conversion. In contact a is that of the whole step: do not start in the step of an impact.
-    Velocities of bodies and joints stay as they are.
+    with v' the velocities after one step. States from `initial_state`, `step` and `rollout` need no
+    conversion. In contact a is the mean over the whole step: do not start in the step of an impact.
+    Velocities of bodies and joints are unchanged.
 
     Args:
-        state: The state, of a simulator with `integrator="second_order"`, without or with a batch
-            axis. Differentiable, like the two others.
+        state: State of a simulator with `integrator="second_order"`, with or without a batch axis.
+            Differentiable, like `control` and `parameters`.
         control: Control of the first step; None holds pins and bodies.
-        parameters: Physical parameters; None takes those of the scene.
-        simulator: The simulator; None takes that of which `state` has been made.
+        parameters: Physical parameters; None: the scene's.
+        simulator: The simulator; None: the simulator that made `state`.
 
     Returns:
         The state with `velocities` at the half step.
@@ -86,5 +86,5 @@ def at_half_step(
 
 
 def with_half_step_velocities(state: State, after: State) -> State:
-    """Replace velocities v at the time of a state by v - (v' - v) / 2, v' those after one step."""
+    """Replace velocities v of a state by v - (v' - v) / 2, v' the velocities one step later."""
     return state.replace(velocities=1.5 * state.velocities - 0.5 * after.velocities)

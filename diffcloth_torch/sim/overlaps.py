@@ -1,4 +1,4 @@
-"""Pairs of surfaces that overlap at the start of a scene: all of them."""
+"""All pairs of surfaces that overlap at the start of a scene."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from diffcloth_torch.sim.records.surfaces import Surfaces
 
 __all__ = ["overlapping_pairs", "with_overlaps_ignored"]
 
-# Surfaces that are nearer than this share of the scene's extent count as overlapping: where they
-# touch, rounding in forward kinematics decides.
+# Surfaces closer than this share of the scene's extent count as overlapping: for touching
+# surfaces, rounding in forward kinematics would decide.
 _TOUCHING = 1e-10
 
 _ROOT = 6  # coordinates of a floating root
@@ -47,7 +47,7 @@ class _Placed(NamedTuple):
         return np.stack([low - self.reach, high + self.reach])
 
     def part_in(self, box: FloatArray) -> _Placed:
-        """The faces whose boxes meet a box; all of a round surface."""
+        """The faces whose boxes meet a box; all faces of a round surface."""
         if self.radius > 0.0:
             return self
         corners = self.vertices[self.faces]
@@ -60,11 +60,11 @@ class _Placed(NamedTuple):
 
 
 def with_overlaps_ignored(scene: Scene, assembly: Assembly, start: Fields) -> Assembly:
-    """Add the pairs that overlap to those that do not collide, where the scene says so.
+    """Add the pairs that overlap to the pairs that do not collide, if the scene requests it.
 
     Args:
-        scene: The scene. Its `ignore_contact` speaks of all bodies and links, that of a robot of
-            the links of the robot.
+        scene: The scene. Its `ignore_contact` refers to all bodies and links, a robot's to the
+            links of the robot.
         assembly: Arrays of the scene.
         start: Fields of the initial state.
     """
@@ -93,8 +93,8 @@ def with_overlaps_ignored(scene: Scene, assembly: Assembly, start: Fields) -> As
 def overlapping_pairs(scene: Scene, assembly: Assembly, start: Fields) -> list[tuple[int, int]]:
     """Pairs of surfaces that intersect, touch, or are closer than their thickness.
 
-    Pairs that do not collide, or of which forces move neither, are left out, and cloths with bodies
-    that they touch at their vertices; so is the overlap of a cloth with itself.
+    Pairs that do not collide, pairs in which forces move neither surface, cloths with bodies that
+    they touch at their vertices, and overlaps of a cloth with itself are left out.
 
     Args:
         scene: The scene.
@@ -139,7 +139,7 @@ def _placed(scene: Scene, assembly: Assembly, start: Fields) -> list[_Placed]:
 
 
 def _parts(assembly: Assembly) -> Iterator[tuple[slice, IndexArray]]:
-    """Rows of each surface's vertices among all, and its faces as indices into them."""
+    """Rows of each surface's vertices among all vertices, and its faces as indices into these."""
     shift = len(assembly.vertices)
     for first, vertex_start, face_start, faces in (
         (0, assembly.cloth_vertex_start, assembly.cloth_face_start, assembly.faces),
@@ -151,7 +151,7 @@ def _parts(assembly: Assembly) -> Iterator[tuple[slice, IndexArray]]:
 
 
 def _overlap(a: _Placed, b: _Placed, touching: float) -> bool:
-    """Whether two surfaces overlap, by the core's own test."""
+    """Return whether two surfaces overlap, by the core's own test."""
     a = a._replace(thickness=a.thickness + touching)
     b = b._replace(thickness=b.thickness + touching)
     a = a.part_in(b.box)
@@ -165,7 +165,7 @@ def _overlap(a: _Placed, b: _Placed, touching: float) -> bool:
 
 
 def _core_of(a: _Placed, b: _Placed) -> _core.Simulator:
-    """A core of two free bodies, whose body frames are the world's."""
+    """Make a core of two free bodies, whose frames coincide with the world's."""
     none, integers = np.zeros(0), np.zeros(0, dtype=np.int32)
     both, all_free = np.arange(2, dtype=np.int32), np.zeros(2 * _ROOT, dtype=np.int32)
     unlimited = np.full(2 * _ROOT, np.inf)
@@ -189,7 +189,7 @@ def _core_of(a: _Placed, b: _Placed) -> _core.Simulator:
         body_faces=np.concatenate([a.faces, b.faces + np.int32(len(a.vertices))]),
         body_radii=np.array([a.radius, b.radius]),
         body_vertex_start=np.array(counts, dtype=np.int32),
-        # No step is taken: any scheme, time step and tolerance will do.
+        # No step is computed: any scheme, time step and tolerance will do.
         self_contact=False,
         dt=1.0,
         scheme="coupled",

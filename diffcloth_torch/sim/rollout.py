@@ -1,4 +1,4 @@
-"""Many steps, keeping the tapes of all of them or of one segment at a time."""
+"""Several steps, with the tapes of all of them or of one segment at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Controls", "StepParameters", "roll_out"]
 
 Controls = Sequence[Control | None] | Callable[[int, State], Control | None] | None
 StepParameters = Parameters | Callable[[int, State], Parameters | None] | None
-"""Of all steps, or a function of the index of a step and the state before it."""
+"""Parameters of all steps, or a function of the index of a step and the state before it."""
 
 Digests = dict[str, bytes]
 
@@ -35,10 +35,10 @@ def roll_out(
     steps: int | None,
     checkpoint_every: int | None,
 ) -> Trajectory:
-    """Take steps one after the other; see `Simulator.rollout`."""
+    """Compute successive steps; see `Simulator.rollout`."""
     count = _step_count(controls, steps)
 
-    asked: dict[int, tuple[Digests, Digests]] = {}  # of what functions have returned
+    asked: dict[int, tuple[Digests, Digests]] = {}  # digests of the values that functions returned
 
     def advance(before: State, first: int, last: int, remember: bool = False) -> list[State]:
         states = []
@@ -104,7 +104,7 @@ def _parameters_at(parameters: StepParameters, k: int, state: State) -> Paramete
 
 
 def _digests(record: Control | Parameters | None) -> Digests:
-    """Digests of what a control or parameters set, by the names of fields and entries."""
+    """Digests of the values in a control or parameters, by the names of fields and entries."""
     digests = {}
     for field, value in ({} if record is None else vars(record)).items():
         if field.startswith("_"):
@@ -139,7 +139,7 @@ def _checkpointed(
     last: int,
     watched: Sequence[Tensor],
 ) -> list[State]:
-    """Take steps first .. last - 1, drop their tapes, and make them again in backward.
+    """Compute steps first .. last - 1, drop their tapes, and repeat them in backward.
 
     Checkpointing hides the version counters of saved tensors, so an edit in place would go
     unnoticed and change the repeated steps; the counters are compared here.

@@ -101,34 +101,33 @@ class Simulator(Observables):
         solver: SolverOptions = _DEFAULT_SOLVER,
         integrator: str = "implicit_euler",
     ) -> None:
-        """Prepare the solver, and choose the barrier parameters that are not given.
+        """Prepare the solver, and choose barrier parameters by default.
 
-        The first step from a state that no step has led to warns where the barrier throws surfaces
-        apart (`BarrierStartWarning`).
+        The first step from an initial state warns if the barrier throws surfaces apart
+        (`BarrierStartWarning`).
 
         Args:
             scene: The scene.
             dt: Time step [s], > 0; a plain number or a float64 one.
             scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
-                first and then contact, close to that result; it needs a staggered coupling if a
+                first and then contact, with a similar result, and needs a staggered coupling if a
                 body or a robot is dynamic. "projective" is the baseline: it solves elasticity with
-                dry friction at the cloths' vertices, against bodies that are boxes, spheres,
-                capsules or planes, and surfaces may cross between vertices.
-            coupling: How cloths and dynamic bodies and robots act on each other: "monolithic"
-                solves for both together; "rigid_to_cloth" moves bodies with their velocities,
-                solves the cloths against them, and changes those velocities by the contact
-                impulses; "cloth_to_rigid" solves the cloths against bodies at rest and then moves
-                the bodies.
+                dry friction at the cloths' vertices, against boxes, spheres, capsules or planes,
+                and surfaces may cross between vertices.
+            coupling: Coupling of cloths with dynamic bodies and robots: "monolithic" solves for
+                both together; "rigid_to_cloth" moves bodies with their velocities, solves the
+                cloths against them, and applies the contact impulses to the velocities;
+                "cloth_to_rigid" solves the cloths against bodies at rest and then moves the bodies.
             contact: Options of contact and friction.
             solver: Tolerance and limits of the solver.
             integrator: "implicit_euler", or "second_order" for the scheme "coupled": second order
-                where motion is smooth, implicit Euler's behavior in contact. Velocities of its
-                states are those half a step earlier: see `at_half_step`.
+                where motion is smooth, implicit Euler's behavior in contact. Its states hold
+                velocities half a step before the positions: see `at_half_step`.
 
         Raises:
             IntersectingState: If surfaces of the scene intersect, touch, or are closer than their
-                thickness; the message has all pairs, and the line that ignores contact between
-                those of bodies and links.
+                thickness. The message names all pairs, and the `ignore_contact` argument for pairs
+                of bodies and links.
             InvalidInput: If a value is not accepted, the barrier is too wide for the meshes, or a
                 pd joint has no gains.
             TypeError: If an argument has a wrong type.
@@ -210,8 +209,8 @@ class Simulator(Observables):
     def initial_state(self, batch_size: int | None = None) -> State:
         """Make the state that the scene describes, at rest.
 
-        With `integrator="second_order"` its velocities are those half a step earlier: see
-        `at_half_step`, which takes one step.
+        With `integrator="second_order"`, velocities are half a step before the positions: see
+        `at_half_step`, which computes one step.
 
         Args:
             batch_size: Number of identical environments, >= 1; None makes a state without a batch
@@ -256,8 +255,8 @@ class Simulator(Observables):
     ) -> Control:
         """Make a control and check it against the scene.
 
-        A target that is None holds its present value; forces, torques and velocities that are None
-        are zero. All but `forces` and `wind` may also be given by name, as in `Control`.
+        A target that is None holds its current value; forces, torques and velocities default to
+        zero. All fields but `forces` and `wind` may also be set by name, as in `Control`.
 
         Args:
             pins: Positions of the pins at the end of the step [m], shape [P, 3].
@@ -271,7 +270,7 @@ class Simulator(Observables):
             base_poses: Poses of kinematic bases at the end of the step, shape [R, 7].
             base_wrenches: Forces and torques on floating bases [N, N m], shape [R, 6].
             attachments: Targets of attachments at the end of the step [m], shape [U, 3].
-            attachment_weights: With which share of their stiffness they pull [-], shape [A].
+            attachment_weights: Weights of the springs of attachments [-], shape [A].
             wind: Velocity of the air around the cloths [m/s], shape [3].
             body_vertices: Vertices of deforming bodies at the end of the step [m], shape [D, 3].
 
@@ -315,7 +314,7 @@ class Simulator(Observables):
         Args:
             state: The state at the start of the step.
             control: Targets for the end of the step, and forces; None holds pins and bodies.
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
 
         Returns:
             The state after `dt`. All of its tensors but `time` carry gradients: `positions`,
@@ -327,9 +326,8 @@ class Simulator(Observables):
             InfeasibleMotion: If bodies, joints or pins cannot reach their targets without an
                 intersection.
             NotConverged: If the solver stops before it reaches its tolerance.
-            TurnedTooFar: If a dynamic body in contact turns by more than 1 rad.
-                `SolverOptions(throw=False)` returns these last three as a status instead of raising
-                them.
+            TurnedTooFar: If a dynamic body in contact turns by more than 1 rad. With
+                `SolverOptions(throw=False)`, these last three are returned as a status instead.
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
@@ -344,29 +342,29 @@ class Simulator(Observables):
     ) -> State:
         """Find a stable static equilibrium near a state. Pure, and differentiable like a step.
 
-        All forces balance there, with pins and prescribed bodies at their targets. Friction resists
-        displacement from the positions in `state`, so the result depends on them, as it does in
-        reality. Damping does not act at rest: its gradient is zero.
+        All forces balance, with pins and prescribed bodies at their targets. Friction resists
+        displacement from the positions in `state`, so the result depends on these, as in reality.
+        Damping has no effect at rest: its gradient is zero.
 
         Args:
-            state: Where the search begins, and where friction counts displacements from. Its
-                velocities are ignored.
+            state: Start of the search, and origin of friction's displacements. Its velocities are
+                ignored.
             control: Targets, and forces that act permanently; None holds pins and bodies.
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
 
         Returns:
-            The state at rest, at the time of `state`. Gradients are those of the equilibrium, at
-            which friction and normal forces have settled: backward and forward repeat the
-            derivative of its last step until that settles, too.
+            The state at rest, at the time of `state`. Its derivatives are those of the equilibrium,
+            with settled friction and normal forces: backward and forward mode iterate the
+            derivative of the last step until it settles as well.
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.
-            SimulationError: If something is free to move, so that the Hessian is singular, or takes
-                more than some 2e4 time steps to swing; the message names it.
+            SimulationError: If something is free to move, so that the Hessian is singular, or
+                swings with a period of more than some 2e4 time steps; the message names it.
             NotConverged: If a solve stops before it reaches its tolerance, or friction does not
                 settle.
             InfeasibleMotion: As for `step`.
-            InvalidInput: As for `step`; also if contact is at vertices, or the control has torques
+            InvalidInput: As for `step`; also if contact is at vertices, or the control sets torques
                 on bodies or bases, or velocities of joints.
         """
         given, batch = self._border.enter(state, control, parameters)
@@ -388,7 +386,7 @@ class Simulator(Observables):
         steps: int | None = None,
         checkpoint_every: int | None = None,
     ) -> Trajectory:
-        """Take several steps.
+        """Simulate several steps.
 
         Args:
             state: The state before the first step.
@@ -397,9 +395,9 @@ class Simulator(Observables):
             parameters: Physical parameters of all steps, or a function of the index of a step and
                 the state before it.
             steps: Number of steps; required unless `controls` is a sequence.
-            checkpoint_every: Keep the tapes of only this many steps at a time; backward repeats
-                these steps from the state before them. Functions are then called again and must
-                return the same values, otherwise backward raises `InvalidInput`.
+            checkpoint_every: Number of steps whose tapes are kept at a time; backward repeats these
+                steps from the state before them. Functions are then called again and must return
+                the same values, otherwise backward raises `InvalidInput`.
 
         Returns:
             The states after each step, as a list that also has each of their fields over time.
@@ -417,7 +415,7 @@ class Simulator(Observables):
     def _advance(
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> State:
-        """Take a step without a look at where it starts."""
+        """Compute a step without a check for throws at its start."""
         return self._advance_given(state, *self._border.enter(state, control, parameters))
 
     def _advance_given(self, state: State, given: Given, batch: int | None) -> State:
@@ -432,7 +430,7 @@ class Simulator(Observables):
     def _copies(
         self, controls: Controls, parameters: StepParameters
     ) -> tuple[Controls, StepParameters]:
-        """Copies of arrays and lists: edits before backward must not change repeated steps."""
+        """Copy arrays and lists: edits before backward must not change repeated steps."""
         if isinstance(controls, Sequence):
             controls = [
                 c if c is None else check_control(self._layout, c, f"controls[{k}]")
@@ -442,7 +440,7 @@ class Simulator(Observables):
             parameters = check_parameters(parameters)
         return controls, parameters
 
-    # What a rollout does between the functions of its caller.
+    # The parts of a rollout between calls of its caller's functions.
     _next, _kept = guarded(_step, "rollout"), guarded(_copies, "rollout")
 
     def _inputs(
@@ -461,5 +459,5 @@ def _restore(
     solver: SolverOptions,
     coupling: str,
 ) -> Simulator:
-    """Make a simulator from a file of 0.1, which names this function."""
+    """Make a simulator from a file of version 0.1, which refers to this function."""
     return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)

@@ -1,4 +1,4 @@
-"""Before the first step: the initial state, the choice of the barrier, and checks of both."""
+"""Preparations of the first step: initial state, choice of the barrier, checks of both."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ __all__ = [
     "initial_tensors",
 ]
 
-# Slower throws are no fault of a start: a cloth that falls gets as fast in a millisecond. [m/s]
+# Slower throws are harmless: a falling cloth reaches this speed in a millisecond. [m/s]
 _SLOW = 0.01
 
-_NAMED = 8  # environments that a warning lists; of more it states the number
+_NAMED = 8  # environments that a warning lists; for more it states their number
 
-# Largest error of a step when its solver stops: in a scene of micrometers the default tolerance
-# would be as long as the barrier.
+# Largest error of a step when its solver stops, as a share of the barrier distance: in a scene of
+# micrometers the default tolerance would be as long as the barrier.
 _LARGEST_PART_OF_BARRIER = 0.1
 
 
@@ -71,10 +71,11 @@ def initial_tensors(assembly: Assembly) -> Fields:
 
 
 def check_time_step(dt: object) -> float:
-    """Return a time step [s] as a float; refuse what is no number in double precision."""
+    """Return a time step [s] as a float; refuse numbers that are not in double precision."""
     instead = "pass a plain number; no gradient with respect to the time step exists: use one"
     number = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
-    # Other numbers are widened as they are. This one is added up, step by step.
+    # Other numbers may be widened. The time step is summed over steps, so its rounding would
+    # grow.
     dtype = str(getattr(dt, "dtype", ""))
     if dtype.endswith(("float32", "float16")):
         raise TypeError(
@@ -104,7 +105,7 @@ def choose_barrier(
     start: Given,
     nonadjacent_distance: float,
 ) -> dict[str, Tensor]:
-    """Take the parameters of the barrier from the contact options, or choose them for the scene.
+    """Return the barrier parameters of the contact options, or choose them for the scene.
 
     Args:
         engine: Engine of the scene.
@@ -136,7 +137,7 @@ def choose_barrier(
 
 
 def choose_slip_rates(assembly: Assembly, contact: ContactOptions) -> dict[str, Tensor]:
-    """Take the slip rates of joints, where forces move any, from the slip velocity of contacts."""
+    """Compute slip rates of joints that forces move from the slip velocity of contacts."""
     if not assembly.forced.any():
         return {}
     return {"joint_slip_rates": _number(slip_rates(assembly, contact.slip_velocity))}
@@ -160,7 +161,7 @@ def check_tolerance(tolerance: float, distance: float, dt: float) -> None:
 
 
 def check_start(engine: Engine, scene: Scene, start: Given) -> None:
-    """Refuse surfaces that overlap, with all pairs of them.
+    """Refuse surfaces that overlap; the error names all pairs.
 
     Args:
         engine: Engine of the scene.
@@ -188,9 +189,9 @@ def check_start(engine: Engine, scene: Scene, start: Given) -> None:
 
 
 class StartWatch:
-    """Looks at the first state of a simulator that no step has led to, and warns of throws there.
+    """Checks a simulator's first initial state for surfaces that the barrier throws apart.
 
-    Where a step has led, surfaces may rest in the barrier, or rebound: only a start can be wrong.
+    After a step, surfaces may rest in the barrier, or rebound: only an initial state can be wrong.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -199,16 +200,16 @@ class StartWatch:
         self._looked = False
 
     def close(self, state: State) -> None:
-        """Look at no other state once a step from a start has been taken."""
+        """Check no other state once a step from an initial state was computed."""
         self._looked = self._looked or state.report is None
 
     def look_at(self, state: State, given: Given, batch: int | None) -> None:
         """Warn if the barrier throws something apart.
 
         Args:
-            state: Where a step starts.
-            given: It, with control and parameters, checked.
-            batch: Its batch size, None without a batch axis.
+            state: State at the start of the step.
+            given: This state, control and parameters, checked.
+            batch: Batch size, None without a batch axis.
         """
         if self._looked or state.report is not None:
             return

@@ -1,1 +1,1 @@
-"""Viewers: each receives the states of a simulation, one after the other."""
+"""Viewers: each receives the states of a simulation in the order of time."""

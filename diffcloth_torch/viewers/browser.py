@@ -1,4 +1,4 @@
-"""A viewer in the browser: a page that plays states while they come, and a file that plays them."""
+"""A viewer in the browser: a page that plays states as they arrive, and a file that plays them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["Browser"]
 
 
 class Browser(Page):
-    """Shows the states that it gets on a page of the browser, and writes them to a page of its own.
+    """Shows states on a page of the browser, and writes them to a file that is a page of its own.
 
-    The page has a slider of the moments, play, speed, what colors the cloths and which arrows are
-    shown. Its server listens on this machine alone unless told otherwise.
+    The page has a slider of the moments, play, speed, coloring of the cloths and arrows. By
+    default, its server listens on this machine alone.
     """
 
     def __init__(
@@ -45,15 +45,15 @@ class Browser(Page):
 
         Args:
             scene: The scene to show.
-            host: Address that the server listens on.
-            port: Its port, or the next one that is free.
+            host: Address of the server.
+            port: Port of the server, or the next free one.
             paints: Name of a cloth, a body or a robot -> its colors.
-            goals: Shapes to show beside the scene.
-            camera: The camera at first.
-            color: What colors the cloths at first, one of `LAYERS`.
-            arrows: Which of `VECTORS` are shown at first.
-            file: A page that is written at the end.
-            live: As a context manager, whether the server runs from the first state on, and at the
+            goals: Target shapes to show.
+            camera: Initial camera.
+            color: Initial coloring of the cloths, one of `LAYERS`.
+            arrows: The `VECTORS` that are shown at first.
+            file: File to which the page is written at the end.
+            live: If true, the context manager runs the server from the first state on, and at the
                 end until the user presses Enter.
 
         Raises:
@@ -72,11 +72,11 @@ class Browser(Page):
         return self.motion
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
-        """Keep a state, and show it if the page follows.
+        """Store a state, and show it if the page follows.
 
         Args:
-            state: With or without a batch axis: several environments stand side by side.
-            gradient: Gradient of a loss by its positions, of their shape.
+            state: State with or without a batch axis; several environments are shown side by side.
+            gradient: Gradient of a loss by the positions, of the same shape.
         """
         with self._lock:
             self.motion.add(state, gradient)

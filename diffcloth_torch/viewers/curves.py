@@ -16,7 +16,7 @@ _COLOR, _BEST_COLOR = "#2a6f97", "#c8553d"
 
 
 def require_matplotlib() -> None:
-    """Test whether curves can be drawn.
+    """Check that curves can be drawn.
 
     Raises:
         InvalidInput: If Matplotlib is not installed; the message names the extra.

@@ -1,4 +1,4 @@
-"""A scene in a page of the browser: the nodes of a viser scene, and one moment in them."""
+"""A scene in a page of the browser: nodes of a viser scene, which show one moment at a time."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SHORTEST_ARROW = 0.01  # of the longest; shorter arrows are left out
 _SHAFT = 0.0025  # fraction of the scene's size: radius of an arrow
 _SPACING = 1.25  # from one environment to the next, in sizes of the scene along an axis
 _SIDES = ("front", "back")
-# What a page need not resolve takes room in its file: positions are rounded to a power of two below
-# this fraction of the scene's size, and normals to this many steps.
+# To limit the size of files, positions are rounded to a power of two below this fraction of the
+# scene's size, and normals to this many steps.
 _RESOLUTION = 1e-5
 _NORMAL_STEPS = 128
 
@@ -33,9 +33,8 @@ _NORMAL_STEPS = 128
 class Drawing:
     """The nodes of a viser scene that show the surfaces of a scene.
 
-    Cloths of one color are meshes whose vertices move. Meshes of viser have no colors of their
-    vertices: cloths that are colored by numbers are binary glTF files, one a moment, of which one
-    is visible.
+    Cloths of one color are meshes whose vertices move. Meshes of viser have no colors of vertices:
+    cloths colored by numbers are binary glTF files, one for each moment, of which one is visible.
     """
 
     def __init__(
@@ -49,16 +48,17 @@ class Drawing:
         first: int = 0,
         places: int | None = None,
     ) -> None:
-        """Prepare the nodes; what moves is added by the first `draw`.
+        """Prepare the nodes; moving ones are added by the first `draw`.
 
         Args:
             api: The scene of a viser server.
-            shown: What is shown of the scene.
-            motion: Moments, which may become more.
-            goals: Shapes beside the scene.
-            bounds: Of everything that will be drawn; None takes those of the motion.
-            first: Place of the first environment, where several drawings share a page.
-            places: Places of all of them; None counts the environments of the motion.
+            shown: The drawn surfaces of the scene.
+            motion: Moments, which may grow in number.
+            goals: Target shapes.
+            bounds: Bounds of all drawn objects; None: the bounds of the motion.
+            first: Place of the first environment, if several drawings share a page.
+            places: Number of places of all drawings; None: the number of environments of the
+                motion.
         """
         self._api, self._shown, self._motion, self._goals = api, shown, motion, goals
         self._first, self._places, self._given = first, places, bounds
@@ -70,7 +70,7 @@ class Drawing:
         self.bounds: Bounds = (np.zeros(3), np.ones(3))
 
     def aim(self, server: Any, camera: Camera) -> None:
-        """Put the camera of the page where that of pictures would be."""
+        """Move the camera of the page to the position of the camera of pictures."""
         low, high = self.bounds
         wide = np.array([*(high - low)[:2] * _SPACING * (self._columns() - 1), 0.0])
         low, high = low - wide / 2, high + wide / 2
@@ -91,8 +91,8 @@ class Drawing:
 
         Args:
             k: Index of the moment.
-            layer: What colors the cloths, one of `LAYERS`.
-            vectors: Which arrows to show: "forces", "gradient" or both.
+            layer: Coloring of the cloths, one of `LAYERS`.
+            vectors: Arrows to show: "forces", "gradient" or both.
         """
         if not self._bodies:
             self._set_up()
@@ -181,9 +181,9 @@ class Drawing:
         )
 
     def prepare(self, layer: str) -> None:
-        """Add what colors the cloths in all moments, hidden.
+        """Add the colored cloths of all moments, hidden.
 
-        A page that plays by itself begins again with the nodes as they were at first.
+        A page without a server restarts with the nodes as they were at first.
         """
         for k in range(len(self._motion) if layer != "plain" else 0):
             self._add_colored(k, layer, visible=False)
@@ -229,14 +229,14 @@ class Drawing:
                     self._set_arrows(e, what, points)
 
     def _arrow_points(self, what: str, ends: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Start and end of the arrows that are long enough to be seen, [n, 2, 3]."""
+        """Start and end of the arrows that are long enough to be visible, [n, 2, 3]."""
         longest = self._motion.longest(what)
         seen = np.linalg.norm(vectors, axis=1) > _SHORTEST_ARROW * longest
         if not seen.any():
             return np.zeros((0, 2, 3))
         scaled = vectors[seen] * (_LONGEST_ARROW * self._size / longest)
         points = ends[: len(seen)][seen]
-        # A force ends where it acts; a gradient begins where it is taken.
+        # A force ends at its point of action; a gradient begins at its vertex.
         start = points - scaled if what == "forces" else points
         return np.stack([start, start + scaled], axis=1)
 
@@ -266,7 +266,7 @@ class Drawing:
         return (np.round(positions / step) * step).astype(np.float32)
 
     def root(self, e: int) -> str:
-        """Name of the node of an environment, which holds all that is drawn of it."""
+        """Name of the node of an environment, which holds all of its drawn objects."""
         return f"/environment_{self._first + e}"
 
     @property
@@ -277,7 +277,7 @@ class Drawing:
         return math.ceil(math.sqrt(self._count))
 
     def _offset(self, e: int) -> tuple[float, float, float]:
-        """Where an environment stands: in rows, around the middle."""
+        """Position of an environment: in rows, around the middle."""
         low, high = self.bounds
         columns = self._columns()
         row, column = divmod(self._first + e, columns)
@@ -298,7 +298,7 @@ def _quaternion(frame: FloatArray) -> tuple[float, ...]:
 
 
 def _colored_mesh(positions: FloatArray, faces: NDArray[Any], painted: NDArray[np.uint8]) -> bytes:
-    """A binary glTF file of a mesh with colors of its vertices, seen from both sides."""
+    """A binary glTF file of a mesh with colors of its vertices, visible from both sides."""
     from trimesh import Scene, Trimesh
     from trimesh.exchange.gltf import export_glb
 

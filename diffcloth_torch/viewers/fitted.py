@@ -1,4 +1,4 @@
-"""A page of the browser that shows a fit: what was observed, beside what is simulated."""
+"""A page of the browser that shows a fit: observations beside the simulation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from diffcloth_torch.viewers.shown import Shown
 
 __all__ = ["FittedPage", "Track"]
 
-_COLOR = (230, 85, 13)  # of what was observed
+_COLOR = (230, 85, 13)  # of observations
 _POINT, _LINE = 0.012, 0.005  # fractions of the scene's size: widths of a point, and of an outline
 _BETWEEN = 8  # points of an outline from one corner to the next
 
@@ -32,9 +32,9 @@ class Track:
     """One trajectory.
 
     Attributes:
-        states: What is simulated, without a batch axis.
-        observed: Of each state the points that were observed [m], shape [n, 3], NaN where one was
-            not; or the corners of an outline seen from above, shape [n, 2].
+        states: Simulated states, without a batch axis.
+        observed: For each state the observed points [m], shape [n, 3], NaN for missing ones; or the
+            corners of an outline seen from above, shape [n, 2].
     """
 
     states: Sequence[State]
@@ -42,7 +42,7 @@ class Track:
 
     @property
     def is_outline(self) -> bool:
-        """Whether outlines were observed."""
+        """Return whether outlines were observed."""
         return bool(self.observed[0].shape[1] == 2)
 
     def points(self) -> list[FloatArray]:
@@ -56,9 +56,9 @@ class Track:
 
 
 class FittedPage(Page):
-    """Shows the trajectories of a fit side by side, each with what was observed of it.
+    """Shows the trajectories of a fit side by side, each with its observations.
 
-    Every `show` takes the place of what was shown before, while the page plays. A moment is one
+    Every `show` replaces the previous trajectories, while the page plays. A moment is one
     observation.
     """
 
@@ -79,13 +79,13 @@ class FittedPage(Page):
 
         Args:
             scenes: The scene of each trajectory.
-            host: Address that the server listens on.
-            port: Its port, or the next one that is free.
+            host: Address of the server.
+            port: Port of the server, or the next free one.
             paints: Name of a cloth, a body or a robot -> its colors.
-            camera: The camera at first.
-            file: A page that is written at the end.
-            live: As a context manager, whether the server runs from the first fit on, and at the
-                end until the user presses Enter.
+            camera: Initial camera.
+            file: File to which the page is written at the end.
+            live: If true, the context manager runs the server from the first fit on, and at the end
+                until the user presses Enter.
 
         Raises:
             InvalidInput: If a package is missing.
@@ -107,18 +107,18 @@ class FittedPage(Page):
 
     @property
     def points(self) -> list[list[FloatArray]]:
-        """What is drawn of the observations, for each trajectory and state, [n, 3] each."""
+        """The drawn points of the observations, for each trajectory and state, [n, 3] each."""
         return self._points
 
     def show(self, tracks: Sequence[Track], text: str = "") -> None:
-        """Show trajectories in place of those before.
+        """Replace the shown trajectories.
 
         Args:
             tracks: One for each scene.
-            text: What the page says of them, in Markdown.
+            text: Text on the page about them, in Markdown.
 
         Raises:
-            InvalidInput: If there are not as many as scenes.
+            InvalidInput: If their number differs from the number of scenes.
         """
         if len(tracks) != len(self._shown):
             raise InvalidInput(
@@ -149,7 +149,7 @@ class FittedPage(Page):
 
 
 class _Beside:
-    """Drawings of several scenes in one, and points beside what they show."""
+    """Drawings of several scenes side by side, with points of their observations."""
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
 """A floor that is only drawn: it fades into the background and receives a soft shadow.
 
 The shadow is a texture. Points on the surfaces are projected to the floor along the light and
-counted on a grid, which is blurred. So layers of cloth have one common shadow, unlike translucent
-projections, and the result does not depend on the shadow maps of a driver.
+counted on a grid, which is blurred. Layers of cloth therefore have one common shadow, unlike
+translucent projections, and the result does not depend on the shadow maps of a driver.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _BLUR = (3, 4, 5)
 
 
 class Floor:
-    """A square at a given height whose texture can be shaded."""
+    """A square at a given height, with a texture that can be shaded."""
 
     def __init__(
         self, pyvista: Any, plotter: Any, bounds: tuple[Points, Points], height: float
@@ -38,8 +38,8 @@ class Floor:
 
         Args:
             pyvista: The module.
-            plotter: Where it is shown.
-            bounds: Lowest and highest coordinates of what stands on it [m].
+            plotter: Plotter that shows it.
+            bounds: Lowest and highest coordinates of the objects above it [m].
             height: Height of the floor [m].
         """
         low, high = bounds
@@ -54,7 +54,7 @@ class Floor:
         self._actor = plotter.add_mesh(plane, texture=self._texture(1.0), lighting=False)
 
     def shade(self, shadow: Points) -> None:
-        """Darken the floor where `shadow`, [texels along y, along x] from 0 to 1, says so."""
+        """Darken the floor by `shadow`, [texels along y, along x] from 0 to 1."""
         self._actor.texture = self._texture(1 - _SHADOW_STRENGTH * shadow)
 
     def _texture(self, light: Points | float) -> Any:
@@ -75,10 +75,10 @@ class Shadow:
     """The shadow of moving surfaces on a floor."""
 
     def __init__(self, floor: Floor, towards_light: Points) -> None:
-        """Remember the floor.
+        """Store the floor.
 
         Args:
-            floor: Where the shadow falls.
+            floor: Floor of the shadow.
             towards_light: Direction to a light that is far away, shape [3].
         """
         self._floor = floor
@@ -94,7 +94,7 @@ class Shadow:
         for (vertices, faces), (chosen, weights) in zip(surfaces, self._samples, strict=True):
             points = np.einsum("nk,nkd->nd", weights, vertices[faces[chosen]])
             drop = points[:, 2:] - self._floor.height
-            # What is below the floor casts nothing.
+            # Points below the floor cast no shadow.
             on_floor = (points[:, :2] - drop * self._shift)[drop[:, 0] > 0]
             place = (on_floor - self._floor.center + self._floor.half_side) / self._texel
             index = np.floor(place).astype(int)

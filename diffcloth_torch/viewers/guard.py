@@ -2,8 +2,8 @@
 
 Any page that the user has open may send requests to servers on this machine. viser answers all of
 them, and its pages offer to make the server public. Here requests must name this machine as their
-host (DNS rebinding), and those of pages must come from the page of the same server (RFC 6455,
-section 10.2); nothing makes the server public.
+host (DNS rebinding), requests from pages must come from the page of the same server (RFC 6455,
+section 10.2), and nothing makes the server public.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["guarded_server", "offline"]
 _STARTING = threading.Lock()
 _FORBIDDEN = 403  # HTTP status
 
-# Everything is a part of the page itself.
+# All content is part of the page itself.
 _POLICY = "default-src data: blob: 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'"
 
 Answer = Callable[[Any, Any], Any]
@@ -34,8 +34,8 @@ def guarded_server(viser: Any, host: str, port: int) -> Any:
 
     Args:
         viser: The module.
-        host: Address that the server listens on.
-        port: Its port, or the next one that is free.
+        host: Address of the server.
+        port: Port of the server, or the next free one.
 
     Raises:
         InvalidInput: If this version of viser cannot be guarded.
@@ -49,7 +49,7 @@ def guarded_server(viser: Any, host: str, port: int) -> Any:
         answer = partial(_answer, host, process_request)
         return real(*arguments, process_request=answer, **options)
 
-    # viser has no hook for requests; it looks `serve` up while it starts.
+    # viser has no hook for requests; it looks up `serve` when it starts.
     with _STARTING:
         sockets.serve = serve  # type: ignore[assignment,misc]
         try:
@@ -70,7 +70,7 @@ def guarded_server(viser: Any, host: str, port: int) -> Any:
 
 
 def _answer(host: str, process_request: Answer, connection: Any, request: Any) -> Any:
-    """The response to a request; None lets a websocket open."""
+    """The response to a request; None allows a websocket to open."""
     problem = _problem(host, request.headers)
     if problem:
         return connection.respond(_FORBIDDEN, f"{problem}\n")
@@ -81,12 +81,12 @@ def _answer(host: str, process_request: Answer, connection: Any, request: Any) -
 
 
 def _problem(host: str, headers: Any) -> str:
-    """Why a request is refused; empty if it is not."""
+    """The reason to refuse a request; empty if it is accepted."""
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or not _is_own(host, hosts[0]):
         return f"the host must be this machine, got {hosts}"
     own = [f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")]
-    # Browsers name the origin of each websocket, and of requests that scripts of other pages send.
+    # Browsers name the origin of each websocket, and of requests by scripts of other pages.
     from_page = len(origins) == 1 and origins[0].lower() in own
     if (origins or headers.get_all("Upgrade")) and not from_page:
         return f"the origin must be the page of this server, got {origins}"
@@ -94,9 +94,9 @@ def _problem(host: str, headers: Any) -> str:
 
 
 def _is_own(host: str, given: str) -> bool:
-    """Whether a host of a request, with or without a port, is the one that the server listens on.
+    """Return whether a host of a request, with or without a port, is the server's own.
 
-    Ports may differ, as those of a tunnel do.
+    Ports may differ, for example with a tunnel.
     """
     try:
         name = urlsplit(f"//{given}").hostname or ""
@@ -106,7 +106,7 @@ def _is_own(host: str, given: str) -> bool:
         return True
     if _is_loopback(host) or host == "localhost":
         return False
-    # No other page has an address for its name; names may be of anyone.
+    # No other page has an address as its name; other names may belong to anyone.
     return _is_address(name) or name in {host.lower(), socket.gethostname(), socket.getfqdn()}
 
 

@@ -29,7 +29,7 @@ _TIME_SIZE = 1 / 18
 _LEGEND_SIZE = 1 / 22
 _LARGEST_LEGEND = 0.25
 _SMALLEST_LETTERS = 7  # pixels
-_LINE = 1.6  # from one line of a legend to the next, in sizes of its letters
+_LINE = 1.6  # distance of the lines of a legend, in sizes of its letters
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Entry:
     """A line of the legend.
 
     Attributes:
-        text: What the colors stand for.
-        colors: One color "#rrggbb", or those of the front and the back.
+        text: Meaning of the colors.
+        colors: One color "#rrggbb", or the colors of front and back.
     """
 
     text: str
@@ -50,8 +50,8 @@ def write_time(image: Image, time: float, step: float) -> Image:
 
     Args:
         image: Colors, shape [height, width, 3].
-        time: What is written [s].
-        step: Shortest time from one picture to the next [s]: so many digits are written.
+        time: Time [s].
+        step: Shortest time between pictures [s], which determines the number of digits.
     """
     decimals = min(max(2, math.ceil(-math.log10(step) - 1e-9)), 6) if step > 0 else 2
     size = image.shape[0] * _TIME_SIZE
@@ -66,13 +66,13 @@ def legend_strip(size: Sequence[int], entries: Sequence[Entry]) -> Image:
 
     Args:
         size: Width and height of the picture with its legend [pixels].
-        entries: Its lines; they may share one.
+        entries: Entries of the legend; several may share a line.
 
     Returns:
         Colors, shape [height, width, 3], with an even height.
     """
     width, letters = size[0], size[1] * _LEGEND_SIZE
-    # Many or long entries: smaller letters rather than a picture without a place for the scene.
+    # With many or long entries, smaller letters leave space for the scene.
     while True:
         lines = _break(entries, width, letters)
         height = 2 * math.ceil((len(lines) + 0.4) * _LINE * letters / 2)
@@ -89,7 +89,7 @@ def legend_strip(size: Sequence[int], entries: Sequence[Entry]) -> Image:
 def _break(
     entries: Sequence[Entry], width: float, letters: float
 ) -> list[list[tuple[float, Entry]]]:
-    """Entries of each line, and where they begin."""
+    """Entries of each line, and their horizontal positions."""
     lines: list[list[tuple[float, Entry]]] = [[]]
     x = start = 0.6 * letters
     for entry in entries:
@@ -103,10 +103,10 @@ def _break(
 
 
 def overview(images: Sequence[Image], entries: Sequence[Entry]) -> Image:
-    """Arrange pictures of one size in rows, and the legend in the cells that are left.
+    """Arrange pictures of one size in rows, and the legend in the remaining cells.
 
-    No cell is blank: where the legend would take several and the pictures alone fill all rows, it
-    is a strip below them; without a legend, a last row that is not full is in the middle.
+    No cell is blank: if the legend would need several cells and the pictures alone fill all rows,
+    it is a strip below them; without a legend, an incomplete last row is centered.
     """
     height, width = images[0].shape[:2]
     columns, rows = _grid(len(images), bool(entries))
@@ -132,12 +132,12 @@ def overview(images: Sequence[Image], entries: Sequence[Entry]) -> Image:
 
 
 def _length(count: int, size: int) -> int:
-    """Pixels of so many cells beside each other."""
+    """Pixels of a number of cells side by side."""
     return count * (size + _MARGIN) - _MARGIN
 
 
 def _grid(count: int, legend: bool) -> tuple[int, int]:
-    """Columns and rows for so many pictures: nearly square, with few cells left for the legend."""
+    """Columns and rows for a number of pictures: nearly square, with few cells for the legend."""
     cells = count + legend
     square = math.ceil(math.sqrt(cells))
 

@@ -1,4 +1,4 @@
-"""Numbers that color the cloths: strain, and forces of contact."""
+"""Scalars that color the cloths: strain, and contact forces."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def strain(cloths: Sequence[Cloth], positions: FloatArray) -> FloatArray:
 
     Args:
         cloths: Cloths of the scene.
-        positions: Vertices of all of them [m], shape [N, 3].
+        positions: Vertices of all cloths [m], shape [N, 3].
 
     Returns:
         Array [N], without unit.
@@ -33,8 +33,8 @@ def strain(cloths: Sequence[Cloth], positions: FloatArray) -> FloatArray:
         rows = slice(first, first := first + len(cloth.vertices))
         X, x = cloth.rest_positions[cloth.faces], positions[rows][cloth.faces]
         rest, now = np.diff(X, axis=1), np.diff(x, axis=1)  # two edges of each face, [f, 2, 3]
-        # With the edges of the rest shape as columns Q R, those of now are F Q R, and F Q is of
-        # shape 3 x 2.
+        # With the edges of the rest shape as columns Q R, the deformed edges are F Q R, and F Q is
+        # of shape 3 x 2.
         triangular = np.linalg.qr(rest.transpose(0, 2, 1)).R
         stretch = np.linalg.solve(triangular.transpose(0, 2, 1), now)
         of_faces = np.abs(np.linalg.svd(stretch, compute_uv=False) - 1).max(axis=-1)
@@ -47,9 +47,9 @@ def strain(cloths: Sequence[Cloth], positions: FloatArray) -> FloatArray:
 
 
 def colors(values: FloatArray, largest: float) -> NDArray[np.uint8]:
-    """Linear colors [..., 4] of numbers from zero to `largest`; without a largest, that of zero.
+    """Linear colors [..., 4] of numbers from zero to `largest`; if that is zero, the color of zero.
 
-    Colors of vertices in glTF files are linear, those of a color map are for the screen (sRGB).
+    Colors of vertices in glTF files are linear, colors of a color map are for the screen (sRGB).
     """
     matplotlib = from_extra("matplotlib", "viewer", "colors of a page need Matplotlib")
     scaled = values / largest if largest > 0 else np.zeros_like(values)

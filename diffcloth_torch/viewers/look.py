@@ -35,7 +35,7 @@ __all__ = [
 
 _FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
 _BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
-# Any two of them, and each beside those of cloths, differ by more than 20 in CIELAB.
+# All pairs of these, and of these with colors of cloths, differ by more than 20 in CIELAB.
 _BODY_COLORS = (
     *("#8d99ae", "#8c7864", "#a3c48c", "#d987a2", "#ac9c58"),
     *("#b59ad4", "#406c68", "#e0957c", "#6fcfcb", "#55aed6"),
@@ -58,7 +58,7 @@ _ACCEPTED = {
 class Camera:
     """The camera of pictures; values of None are derived from the motion.
 
-    Give a position, or directions in degrees from which it follows.
+    Set a position, or directions in degrees that determine it.
 
     Attributes:
         azimuth: Direction of view in degrees: 0 looks along +y, 90 along -x.
@@ -66,8 +66,9 @@ class Camera:
         zoom: Divisor of the distance, > 0.
         target: Point at the center of the picture [m], shape [3].
         distance: Distance from the target, before the zoom [m], > 0.
-        position: Position of the camera [m], shape [3]; with it only `target` counts of the above.
-        up: Direction that is up in the picture, shape [3].
+        position: Position of the camera [m], shape [3]; if given, all of the above except `target`
+            are ignored.
+        up: Upward direction in the picture, shape [3].
         field_of_view: Vertical angle of the picture in degrees, between 0 and 180.
     """
 
@@ -78,7 +79,7 @@ class Camera:
     distance: float | None = None
     position: Sequence[float] | None = None
     up: Sequence[float] = (0.0, 0.0, 1.0)
-    field_of_view: float = 26.0  # long enough a lens that nothing looks bent
+    field_of_view: float = 26.0  # a lens long enough to avoid visible distortion
 
     def __post_init__(self) -> None:
         for name in ("target", "position", "up"):
@@ -98,14 +99,14 @@ class Camera:
             self._check_view(view)
 
     def place(self, center: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
-        """Find the position of the camera and the point that it looks at [m].
+        """Compute the position of the camera and the point at which it looks [m].
 
         Args:
             center: Center of the scene [m].
             radius: Radius of a ball around the scene [m].
 
         Raises:
-            InvalidInput: If it looks along `up`, or its position is the point that it looks at.
+            InvalidInput: If it looks along `up`, or its position is the point at which it looks.
         """
         target = center if self.target is None else np.array(self.target, dtype=np.float64)
         if self.position is not None:
@@ -140,16 +141,16 @@ class Pictures:
 
     Attributes:
         size: Width and height [pixels], even numbers.
-        fps: Pictures per second; None plays in real time.
+        fps: Pictures per second; None: real time.
         video: Kind of the animation.
-        frames: Whether every picture of the animation is kept.
+        frames: If true, every picture of the animation is kept.
         sheet: Number of moments in the overview, from the first to the last; 0 for no overview.
-        labels: Whether pictures show the time and a legend.
-        contact_forces: Whether arrows show the contact forces on the vertices of bodies and links
-            (`State.body_forces`). They end where the forces act; the longest arrow of the motion is
-            a fifth of the size of the scene.
+        labels: If true, pictures show the time and a legend.
+        contact_forces: If true, arrows show the contact forces on the vertices of bodies and links
+            (`State.body_forces`). They end at the points of action; the longest arrow of the motion
+            is a fifth of the size of the scene.
         ground: Height of a floor that is only drawn [m]: "auto" means the height of a static level
-            plane of the scene, or else below everything; None means no floor.
+            plane of the scene, or else below all surfaces; None means no floor.
         camera: The camera.
     """
 
@@ -177,14 +178,14 @@ class Paint:
     back_color: str | None = None
 
     def for_cloth(self, index: int) -> Paint:
-        """Take what is None from the palette of cloths."""
+        """Replace None by colors of the palette of cloths."""
         return Paint(
             self.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
             self.back_color or _BACK_COLORS[index % len(_BACK_COLORS)],
         )
 
     def for_body(self, index: int) -> Paint:
-        """Take what is None from the palette of bodies and robots."""
+        """Replace None by a color of the palette of bodies and robots."""
         return Paint(self.color or _BODY_COLORS[index % len(_BODY_COLORS)])
 
 
@@ -202,7 +203,7 @@ class Goal:
 
 
 def checked_camera(owner: str, camera: Camera | None) -> Camera:
-    """The camera, or the one that is meant by None."""
+    """Return the camera, or the default camera for None."""
     given: object = camera
     if given is not None and not isinstance(given, Camera):
         raise TypeError(f"{owner}: `camera` must be a Camera or None, got {type(given).__name__}")

@@ -20,7 +20,7 @@ class MeshSequence:
         """Make the folder, and remove files of an earlier sequence from it.
 
         Args:
-            folder: Where the files go.
+            folder: Folder of the files.
         """
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.glob("frame_*.obj"):
@@ -29,14 +29,14 @@ class MeshSequence:
         self._count = 0
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
-        """Write one file of a state."""
+        """Write the file of a state."""
         file = self._folder / f"frame_{self._count:04d}.obj"
         with writing(file):
             state.export(file, bodies=True)
         self._count += 1
 
     def __enter__(self) -> MeshSequence:
-        """Have nothing more to open."""
+        """Return the viewer; nothing needs to be opened."""
         return self
 
     def __exit__(
@@ -45,4 +45,4 @@ class MeshSequence:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Have nothing to finish: each file is complete."""
+        """Do nothing: each file is complete."""

@@ -1,4 +1,4 @@
-"""The states that a viewer has been shown, as the arrays that it draws."""
+"""The states of a viewer, as the arrays that it draws."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from diffcloth_torch.viewers.shown import Bounds, Shown
 __all__ = ["LAYERS", "Moment", "Motion"]
 
 LAYERS = ("plain", "strain", "contact")
-"""What colors the cloths: their own colors, their strain, or the contact forces on them [N]."""
+"""Colorings of the cloths: own colors, strain, or the contact forces on them [N]."""
 
-_COLORED = 0.99  # of the numbers: a few peaks would leave one color for all else
+_COLORED = 0.99  # share of the numbers: a few peaks would leave one color for all others
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class Moment:
     """One state of E environments.
 
     Attributes:
-        time: Time of the first of them [s].
+        time: Time of the first environment [s].
         positions: Cloth vertices [m], [E, N, 3].
-        frames: Frames of the bodies and links that are shown, [E, n, 4, 4].
+        frames: Frames of the drawn bodies and links, [E, n, 4, 4].
         forces: Contact forces on the cloths' vertices [N], [E, N, 3].
-        body_forces: The same on the vertices of these bodies and links, [E, v, 3].
+        body_forces: Contact forces on the vertices of these bodies and links, [E, v, 3].
         gradient: Gradient of a loss by the cloths' vertices, [E, N, 3]; None if not given.
     """
 
@@ -45,7 +45,7 @@ class Moment:
     gradient: FloatArray | None
 
     def vectors(self, what: str) -> FloatArray | None:
-        """Vectors of "forces" at all vertices, or of "gradient" at those of cloths, [E, v, 3]."""
+        """Vectors of "forces" at all vertices, or of "gradient" at the cloths', [E, v, 3]."""
         if what == "gradient":
             return self.gradient
         return np.concatenate([self.forces, self.body_forces], axis=1)
@@ -58,7 +58,7 @@ class Motion(list[Moment]):
         """Begin without moments.
 
         Args:
-            shown: What is shown of the scene.
+            shown: The drawn surfaces of the scene.
         """
         super().__init__()
         self._shown = shown
@@ -67,7 +67,7 @@ class Motion(list[Moment]):
         self._lengths: defaultdict[str, list[float]] = defaultdict(list)  # of kinds of vectors
 
     def add(self, state: State, gradient: Tensor | None = None) -> None:
-        """Keep a state, and the gradient of a loss by its positions, of the same shape.
+        """Store a state, and the gradient of a loss by its positions, of the same shape.
 
         Raises:
             InvalidInput: If the gradient has another shape.
@@ -86,7 +86,7 @@ class Motion(list[Moment]):
         shown = self._shown
 
         def environments(array: FloatArray) -> FloatArray:
-            # A copy: what a simulation does with its tensors later must not change what was shown.
+            # A copy: later changes of a simulation's tensors must not change shown states.
             return np.array(array if batched else array[None])
 
         self.append(
@@ -101,7 +101,7 @@ class Motion(list[Moment]):
         )
 
     def bounds(self, goals: Sequence[Goal]) -> Bounds:
-        """Bounds of all moments, and of shapes beside them."""
+        """Bounds of all moments, and of target shapes."""
         return self._shown.bounds(
             [x for moment in self for x in moment.positions],
             [f for moment in self for f in moment.frames],
@@ -109,7 +109,7 @@ class Motion(list[Moment]):
         )
 
     def values(self, layer: str, k: int) -> FloatArray:
-        """Numbers that color the cloths in moment k, [E, N]."""
+        """Scalars that color the cloths in moment k, [E, N]."""
         known = self._values[layer]
         for moment in self[len(known) : k + 1]:
             if layer == "contact":
@@ -120,7 +120,7 @@ class Motion(list[Moment]):
         return known[k]
 
     def top(self, layer: str) -> float:
-        """The number at the top of the color map: all but the largest percent that are not zero."""
+        """The top of the color map, above all but the largest percent of the nonzero numbers."""
         if self._tops.get(layer, (0, 0.0))[0] != len(self):
             found = np.concatenate([self.values(layer, k).ravel() for k in range(len(self))])
             found = found[found > 0]
@@ -129,7 +129,7 @@ class Motion(list[Moment]):
         return self._tops[layer][1]
 
     def longest(self, what: str) -> float:
-        """The length of the longest of the vectors in the whole motion; 0 if there are none."""
+        """The largest length of the vectors in the whole motion; 0 if there are none."""
         lengths = self._lengths[what]
         for moment in self[len(lengths) :]:
             vectors = moment.vectors(what)

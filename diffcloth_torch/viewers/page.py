@@ -1,4 +1,4 @@
-"""Pages of the browser that play a motion, from a server while it comes, or from a file."""
+"""Pages of the browser that play a motion, from a server during the simulation, or from a file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ P = TypeVar("P", bound="Page")
 DEFAULT_CAMERA = Camera()
 
 VECTORS = ("forces", "gradient")
-"""Arrows: contact forces on everything, and the gradient of a loss by the cloths' vertices."""
+"""Arrows: contact forces on all surfaces, and the gradient of a loss by the cloths' vertices."""
 
 _HEIGHT = 480  # pixels of a page inside a notebook
 _SHORTEST_WAIT = 0.01  # seconds between two moments of the page
@@ -41,22 +41,22 @@ class Drawn(Protocol):
     """The nodes of a viser scene, and one moment in them."""
 
     def draw(self, k: int, layer: str, vectors: Sequence[str]) -> None:
-        """Show moment k: what colors the cloths, and which arrows there are."""
+        """Show moment k with a coloring of the cloths, and with these arrows."""
         ...
 
     def prepare(self, layer: str) -> None:
-        """Add what colors the cloths in all moments, hidden."""
+        """Add the colored cloths of all moments, hidden."""
         ...
 
     def aim(self, server: Any, camera: Camera) -> None:
-        """Put the camera of the page where that of pictures would be."""
+        """Move the camera of the page to the position of the camera of pictures."""
         ...
 
 
 class Page(ABC):
-    """A page with a slider of the moments, play, speed, what colors the cloths and which arrows.
+    """A page with a slider of the moments, play, speed, coloring of the cloths and arrows.
 
-    Its server listens on this machine alone unless told otherwise, and answers the page alone.
+    By default, its server listens on this machine alone; it answers only requests of its own page.
     """
 
     vectors: tuple[str, ...] = VECTORS
@@ -75,13 +75,13 @@ class Page(ABC):
         """Check that pages can be made; the server starts with the first state.
 
         Args:
-            host: Address that the server listens on.
-            port: Its port, or the next one that is free.
-            camera: The camera at first.
-            color: What colors the cloths at first, one of `LAYERS`.
-            arrows: Which of `vectors` are shown at first.
-            file: A page that is written at the end.
-            live: As a context manager, whether the server runs from the first state on, and at the
+            host: Address of the server.
+            port: Port of the server, or the next free one.
+            camera: Initial camera.
+            color: Initial coloring of the cloths, one of `LAYERS`.
+            arrows: The `vectors` that are shown at first.
+            file: File to which the page is written at the end.
+            live: If true, the context manager runs the server from the first state on, and at the
                 end until the user presses Enter.
 
         Raises:
@@ -99,7 +99,7 @@ class Page(ABC):
         self._host, self._port = host, port
         self._camera, self._file = camera, file
         self._color, self._arrow_names, self._live = color, tuple(arrows), live
-        self._lock = threading.RLock()  # of what the page shows: a user may move a slider meanwhile
+        self._lock = threading.RLock()  # of the content: a user may move a slider meanwhile
         self._server: Any = None
         self._drawing: Drawn | None = None
         self._closed = threading.Event()
@@ -111,11 +111,11 @@ class Page(ABC):
 
     @abstractmethod
     def _draw_on(self, api: Any) -> Drawn:
-        """Make the nodes of what is shown in the scene of a viser server."""
+        """Make the nodes of the shown scene in a viser server."""
 
     @property
     def url(self) -> str:
-        """Address of the page; the server starts if it does not run."""
+        """Address of the page; starts the server if necessary."""
         server = self._serving()
         return f"http://{server.get_host()}:{server.get_port()}"
 
@@ -136,11 +136,11 @@ class Page(ABC):
                 self._server, self._drawing = None, None
 
     def save(self, path: str | Path, *, speed: float = 1.0) -> None:
-        """Write a page that plays the motion by itself, without a server or a connection.
+        """Write a page that plays the motion alone, without a server or a connection.
 
         Args:
             path: File to write, in an existing folder; an existing file is replaced.
-            speed: Speed of the motion, 1 in real time.
+            speed: Speed of the motion relative to real time.
         """
         page = self._page(speed)
         with replace_file(Path(path)) as part:
@@ -153,7 +153,7 @@ class Page(ABC):
         )
 
     def __enter__(self: P) -> P:
-        """Start the server where the viewer is live."""
+        """Start the server if the viewer is live."""
         if self._live:
             print(f"The page is at {self.url}", file=sys.stderr)
         return self
@@ -175,7 +175,7 @@ class Page(ABC):
     def _page(self, speed: float) -> str:
         if not self.moments:
             raise InvalidInput("show: there must be at least one state")
-        # A server of its own: the one of the page goes on.
+        # A separate server: the one of the page continues.
         server = self._start("127.0.0.1")
         try:
             drawing = self._draw_on(server.scene)
@@ -221,7 +221,7 @@ class Page(ABC):
             control.on_update(lambda _: self._draw())
 
     def _extend(self) -> None:
-        """Take note of a new moment."""
+        """Add a new moment to the page."""
         if self._drawing is None:
             self._drawing = self._draw_on(self._server.scene)
             self._draw()
@@ -245,7 +245,7 @@ class Page(ABC):
         """Move from moment to moment while the page of a server plays."""
         while True:
             with self._lock:
-                if self._server is not server:  # nobody stops it while this holds the lock
+                if self._server is not server:  # the lock prevents a later stop
                     return
                 k, count = int(self._moment.value), len(self.moments)
                 wait = _SHORTEST_WAIT
@@ -264,7 +264,7 @@ def _stop(server: Any) -> None:
 
 @contextmanager
 def _silently() -> Iterator[None]:
-    """Without the announcements of servers, which in a notebook are no standard output."""
+    """Suppress the announcements of servers, which notebooks show below cells."""
     from rich import get_console
 
     console = get_console()

@@ -34,10 +34,10 @@ _GIF_STEP = 2  # a GIF keeps one of this many pixels along each axis
 
 
 class Record:
-    """Keeps the states that it is shown and draws them at the end, when the whole motion is known.
+    """Stores states, and draws them at the end, when the whole motion is known.
 
-    The files are `NAME.mp4` or `NAME.gif`, `NAME.png` (an overview of some moments), and if asked
-    for `NAME_frames/0000.png` and so on.
+    The files are `NAME.mp4` or `NAME.gif`, `NAME.png` (an overview of some moments), and optionally
+    `NAME_frames/0000.png` and so on.
     """
 
     def __init__(
@@ -56,14 +56,15 @@ class Record:
         Args:
             folder: Existing folder for the files.
             scene: The scene to show.
-            fps: Pictures per second, unless `pictures` has them.
+            fps: Pictures per second, unless `pictures` sets them.
             pictures: Options of the pictures.
             paints: Name of a cloth, a body or a robot -> its colors.
-            goals: Shapes to show beside the scene.
+            goals: Target shapes to show.
             name: Name of the files.
 
         Raises:
-            InvalidInput: If a package is missing; the message says how to install it.
+            InvalidInput: If a package is missing; the message contains the command that installs
+                it.
         """
         require_pyvista()
         for kind in (pictures.video, "png" if pictures.sheet else "none"):
@@ -82,7 +83,7 @@ class Record:
         self._forces: list[NDArray[np.float64]] = []
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
-        """Keep one state; pictures have no gradients."""
+        """Store one state; pictures show no gradients."""
         self._positions.append(state.positions.detach().numpy().copy())
         self._frames.append(self._shown.frames(state))
         self._times.append(float(state.time))
@@ -90,7 +91,7 @@ class Record:
             self._forces.append(self._shown.forces(state))
 
     def __enter__(self) -> Record:
-        """Return the recorder; nothing is left to open."""
+        """Return the recorder; nothing needs to be opened."""
         return self
 
     def __exit__(
@@ -99,7 +100,7 @@ class Record:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Draw all states; also after a failed step, to show what led to it."""
+        """Draw all states; also after a failed step, to show the motion before it."""
         if self._positions and (kind is None or issubclass(kind, SimulationError)):
             self._draw_all()
 
@@ -112,7 +113,7 @@ class Record:
         low, high = bounds
         arrows, entries = self._arrows(float(np.linalg.norm(high - low)))
         labels = self._options.labels
-        # The legend is a part of each picture, except in an overview, where it has a place.
+        # The legend is a part of each picture, except in an overview, where it has a cell.
         legend = None
         if labels and (all_are_kept or len(moments) == 1):
             legend = legend_strip(self._options.size, entries)
@@ -136,7 +137,7 @@ class Record:
             _write_image(self._folder / f"{self._name}.png", image)
 
     def _arrows(self, size: float) -> tuple[Sequence[FloatArray | None], list[Entry]]:
-        """Arrows [m] of each state if forces are shown, and all lines of the legend."""
+        """Arrows [m] of each state if forces are shown, and all entries of the legend."""
         entries = []
         for name, paint in self._shown.paints.items():
             colors = [color for color in (paint.color, paint.back_color) if color is not None]

@@ -43,16 +43,16 @@ def render(
         states: States in the order of time, without a batch axis.
         path: File to write, in an existing folder; an existing file is replaced.
         size: Width and height of a picture [pixels], even numbers from 64 to 4096.
-        fps: Pictures per second of an animation, > 0; None plays in real time.
+        fps: Pictures per second of an animation, > 0; None: real time.
         moments: Number of pictures in an overview, from the first state to the last, >= 1.
-        labels: Whether pictures show the time and a legend.
-        contact_forces: Whether arrows show the contact forces on bodies and links
+        labels: If true, pictures show the time and a legend.
+        contact_forces: If true, arrows show the contact forces on bodies and links
             (`State.body_forces`).
-        camera: The camera; None looks from the front, slightly from above.
+        camera: The camera; None: a view from the front, slightly from above.
 
     Raises:
-        InvalidInput: If an argument is not accepted, or if a package is missing; the message says
-            how to install it.
+        InvalidInput: If an argument is not accepted, or if a package is missing; the message
+            contains the command that installs it.
         TypeError: If `states` contains other objects than states.
     """
     path = as_path("render: `path`", path)
@@ -97,17 +97,17 @@ def render(
 def checked_states(
     owner: str, scene: Scene, states: State | Sequence[State], *, batches: bool = False
 ) -> list[State]:
-    """List states, and refuse those that are not of a scene.
+    """Return a list of states; refuse states of other scenes.
 
     Args:
-        owner: What the messages begin with.
+        owner: Prefix of messages.
         scene: The scene.
-        states: What was given, one state or several.
-        batches: Whether states may have a batch axis, all of them the same.
+        states: One state or several.
+        batches: If true, states may have a batch axis, of the same size for all.
 
     Raises:
-        InvalidInput: If there is no state, or one is of another shape.
-        TypeError: If something is no state.
+        InvalidInput: If there is no state, or one has another shape.
+        TypeError: If an item is not a State.
     """
     given: object = states
     if not isinstance(given, State | Iterable):
@@ -158,6 +158,6 @@ def checked_states(
 
 
 def _real_time(states: Sequence[State]) -> float:
-    """Pictures per second that take as long as the motion."""
+    """Pictures per second for an animation in real time."""
     duration = float(states[-1].time) - float(states[0].time)
     return (len(states) - 1) / duration if duration > 0 else _ONE_STATE_FPS

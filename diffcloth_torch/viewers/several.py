@@ -15,14 +15,14 @@ __all__ = ["Viewers"]
 
 
 class Viewers:
-    """Several viewers, each of which is shown every n-th state."""
+    """Several viewers, each of which shows every n-th state."""
 
     def __init__(self, viewers: Iterable[Viewer], every: int = 1) -> None:
-        """Remember the viewers.
+        """Store the viewers.
 
         Args:
-            viewers: Each is shown the same states.
-            every: States from one that is shown to the next.
+            viewers: Viewers that show the same states.
+            every: Number of states from one that is shown to the next.
         """
         self._viewers = list(viewers)
         self._every = every
@@ -30,14 +30,14 @@ class Viewers:
         self._stack = ExitStack()
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
-        """Take the next state, and the gradient of a loss by its positions."""
+        """Show the next state, and the gradient of a loss by its positions."""
         if self._count % self._every == 0:
             for viewer in self._viewers:
                 viewer.show(state, gradient)
         self._count += 1
 
     def __enter__(self) -> Viewers:
-        """Open all of them."""
+        """Open all viewers."""
         for viewer in self._viewers:
             self._stack.enter_context(viewer)
         return self
@@ -48,5 +48,5 @@ class Viewers:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish all of them."""
+        """Finish all viewers."""
         self._stack.__exit__(kind, error, trace)

@@ -31,7 +31,7 @@ def show(
     camera: Camera | None = None,
     port: int = 8080,
 ) -> Browser:
-    """Show states in the browser: play, scrub, and look at them from all sides.
+    """Show states in the browser: play, scrub, and view them from all sides.
 
     >>> dc.show(scene, states, "motion.html")          # a page that needs no server
     >>> dc.show(scene, states, color="strain").wait()  # prints its address, and stays
@@ -40,22 +40,22 @@ def show(
 
     Args:
         scene: Scene of the states.
-        states: States in the order of time; of a batch, environments stand side by side.
+        states: States in the order of time; environments of a batch are shown side by side.
         path: File `.html` to write instead of a server; an existing file is replaced.
-        color: What colors the cloths: "plain", their own colors; "strain", by how much the singular
-            values of dx/dX differ from one; or "contact", the contact forces on them [N].
-        arrows: Any of "forces", the contact forces on everything, and "gradient".
-        gradients: For "gradient": of each state the gradient of a loss by its positions.
-        goals: Shapes to show beside the scene.
-        camera: The camera at first; None looks from the front, slightly from above.
-        port: Port of the server on this machine, or the next one that is free.
+        color: Coloring of the cloths: "plain", their own colors; "strain", the deviation of the
+            singular values of dx/dX from one; or "contact", the contact forces on them [N].
+        arrows: Any of "forces", the contact forces on all surfaces, and "gradient".
+        gradients: For "gradient": for each state the gradient of a loss by its positions.
+        goals: Target shapes to show.
+        camera: Initial camera; None: a view from the front, slightly from above.
+        port: Port of the server on this machine, or the next free one.
 
     Returns:
         The page: `url`, `wait()`, `save(path)`, `close()`.
 
     Raises:
-        InvalidInput: If an argument is not accepted, or if a package is missing; the message says
-            how to install it.
+        InvalidInput: If an argument is not accepted, or if a package is missing; the message
+            contains the command that installs it.
         TypeError: If `states` contains other objects than states.
     """
     shown = checked_states("show", scene, states, batches=True)
@@ -92,7 +92,7 @@ def show(
 
 
 def _is_notebook() -> bool:
-    """Whether the returned page is shown below a cell."""
-    loaded = sys.modules.get("IPython")  # whoever runs cells has imported it
+    """Return whether the returned page is shown below a cell."""
+    loaded = sys.modules.get("IPython")  # notebooks have imported it
     shell = None if loaded is None else loaded.get_ipython()
     return type(shell).__name__ == "ZMQInteractiveShell"

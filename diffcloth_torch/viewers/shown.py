@@ -1,4 +1,4 @@
-"""What of a scene is shown, and in which colors: cloths, bodies, links with a shape."""
+"""The shown parts of a scene, and their colors: cloths, bodies, links with a shape."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Rigid:
     """A surface of a body or a link: vertices [v, 3] in its frame, faces [f, 3].
 
     Attributes:
-        name: Its name: "body" or "robot/link".
+        name: Name of the surface: "body" or "robot/link".
         owner: Name of the body or the robot.
-        vertices: Vertices in its frame [m].
+        vertices: Vertices in the frame of the body or link [m].
         faces: Vertex indices.
-        shown: Whether it is drawn; a level plane is not, as the floor replaces it.
+        shown: True if it is drawn; a level plane is not, as the floor replaces it.
     """
 
     name: str
@@ -49,25 +49,25 @@ class Rigid:
 
 
 class Shown:
-    """The surfaces of a scene that are drawn, and where they are in a state.
+    """The drawn surfaces of a scene, and their places in a state.
 
     Attributes:
         scene: The scene.
         rigid: Surfaces of bodies, then of links with a shape, in the order of `State.body_forces`.
         cloth_faces: Faces of each cloth, as indices into its own vertices, [f, 3].
         cloth_starts: First row of each cloth among the positions, and the number of all rows.
-        paints: Name of a cloth, of a shown body or robot -> its colors, none of them None.
+        paints: Name of a cloth, of a drawn body or robot -> its colors, none of them None.
     """
 
     def __init__(self, scene: Scene, paints: Mapping[str, Paint]) -> None:
-        """Find what is shown.
+        """Select the surfaces to draw.
 
         Args:
             scene: The scene.
             paints: Name of a cloth, a body or a robot -> its colors.
 
         Raises:
-            InvalidInput: If there is nothing to show.
+            InvalidInput: If the scene has no surface to draw.
         """
         self.scene = scene
         self._surfaces = Surfaces.of(scene, assemble(scene))
@@ -91,26 +91,26 @@ class Shown:
 
     @property
     def shown_rigid(self) -> list[Rigid]:
-        """The surfaces of bodies and links that are drawn."""
+        """The drawn surfaces of bodies and links."""
         return [surface for surface in self.rigid if surface.shown]
 
     def frames(self, state: State) -> FloatArray:
-        """Frames [..., n, 4, 4] of the bodies and links that are drawn."""
+        """Frames [..., n, 4, 4] of the drawn bodies and links."""
         frames = self._surfaces.surface_frames(vars(state.detach()))
         shown: FloatArray = frames.numpy()[..., [surface.shown for surface in self.rigid], :, :]
         return shown
 
     def placed(self, frames: FloatArray) -> list[FloatArray]:
-        """Vertices [v, 3] in the world of the bodies and links that are drawn."""
+        """Vertices [v, 3] in the world of the drawn bodies and links."""
         return [
             place(surface.vertices, torch.from_numpy(frame)).numpy()
             for surface, frame in zip(self.shown_rigid, frames, strict=True)
         ]
 
     def forces(self, state: State) -> FloatArray:
-        """Contact forces on the vertices of what is drawn of bodies and links [N], [..., v, 3].
+        """Contact forces on the vertices of drawn bodies and links [N], [..., v, 3].
 
-        Those on a smooth body are one, at the vertex that faces it.
+        Forces on a smooth body are summed to one force, at the vertex that faces it.
         """
         state = state.detach()
         counts = [len(points) for points in self._surfaces.rigid_points().values()]
@@ -136,7 +136,7 @@ class Shown:
         Args:
             positions: Cloth vertices of each state [m], shape [N, 3].
             frames: Frames of each state, shape [n, 4, 4].
-            goals: Shapes beside the scene.
+            goals: Target shapes.
         """
         placed = (points for f in np.unique(frames, axis=0) for points in self.placed(f))
         lows, highs = [], []
@@ -147,7 +147,7 @@ class Shown:
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def ground(self, bounds: Bounds) -> float:
-        """Height of the floor [m]: of a static level plane, or else below everything."""
+        """Height of the floor [m]: of a static level plane, or else below all surfaces."""
         floors = [body for body in self.scene.bodies if _is_floor(body)]
         if floors:
             return max(float(_placed_body(body)[0, 2]) for body in floors)
@@ -160,6 +160,6 @@ def _placed_body(body: RigidBody) -> NDArray[np.float64]:
 
 
 def _is_floor(body: RigidBody) -> bool:
-    """Whether a body is a static level plane, as `RigidBody.plane` makes them."""
+    """Return whether a body is a static level plane, as made by `RigidBody.plane`."""
     is_plane = len(body.vertices) == 4 and len(body.faces) == 2
     return is_plane and body.motion == "static" and not np.ptp(_placed_body(body)[:, 2])

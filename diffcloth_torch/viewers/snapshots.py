@@ -1,4 +1,4 @@
-"""Pictures of single states of a scene, by a camera that stays open between them."""
+"""Pictures of single states of a scene, by a camera that stays open."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffcloth_torch.viewers.stage import Skin, Stage
 
 __all__ = ["Snapshots"]
 
-_ROOM = 0.35  # that the bounds of the first state gain on all sides, in shares of its size
+_ROOM = 0.35  # added to the bounds of the first state on all sides, as a share of its size
 
 
 class Snapshots:
@@ -33,10 +33,11 @@ class Snapshots:
             scene: The scene.
             state: Its first state, without a batch axis.
             size: Width and height [pixels].
-            camera: Where to look from.
+            camera: The camera.
 
         Raises:
-            InvalidInput: If pyvista is not installed; the message says how to install it.
+            InvalidInput: If pyvista is not installed; the message contains the command that
+                installs it.
         """
         self.size = size
         self._shown = Shown(scene, {})

@@ -1,6 +1,6 @@
 """The stage for pictures: lights, floor, cloths of two colors, bodies and targets.
 
-Everything is drawn off screen. On a machine without a display VTK draws through EGL.
+All objects are drawn off screen. On a machine without a display VTK draws through EGL.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Points = NDArray[np.float64]
 Triangles = NDArray[np.integer[Any]]
 Image = NDArray[np.uint8]
 
-# Directions to the lights, for a camera that looks along +y. They turn with the camera, so that
-# visible sides are lit. The key light also casts the shadow.
+# Directions to the lights, for a camera that looks along +y. The lights turn with the camera, so
+# that visible sides are lit. The key light also casts the shadow.
 _SUN = np.array([-0.45, -0.55, 1.0])
 # Direction, intensity and color of the other lights: cool ones across and from behind.
 _FILL = (np.array([1.0, -0.7, 0.3]), 0.45, "#e4eeff")
@@ -44,7 +44,7 @@ class Skin:
 
     Attributes:
         faces: Vertex indices, shape [f, 3].
-        paint: Its colors, none of them None.
+        paint: Colors, none of them None.
     """
 
     faces: Triangles
@@ -55,7 +55,7 @@ def require_pyvista() -> Any:
     """Import pyvista for drawing off screen.
 
     Raises:
-        InvalidInput: If it is not installed; the message says how to install it.
+        InvalidInput: If it is not installed; the message contains the command that installs it.
     """
     if not os.environ.get("DISPLAY"):
         # Otherwise VTK tries an X server first, and prints a warning about it.
@@ -69,7 +69,7 @@ def require_pyvista() -> Any:
 
 
 class _Surface:
-    """A mesh on the stage whose vertices move."""
+    """A mesh with moving vertices on the stage."""
 
     def __init__(self, polydata: Any, crease: float | None) -> None:
         self.polydata = polydata
@@ -91,7 +91,7 @@ class _Surface:
 
 
 class Stage:
-    """Draws a scene whose surfaces move. A context manager: the window is freed at the end."""
+    """Draws a scene with moving surfaces. A context manager: the window is freed at the end."""
 
     def __init__(
         self,
@@ -106,12 +106,12 @@ class Stage:
         """Set the stage.
 
         Args:
-            cloths: Cloths, whose faces are indices into the positions that `draw` gets.
+            cloths: Cloths, whose faces are indices into the positions for `draw`.
             bodies: Bodies and links, whose faces are indices into their own vertices.
             size: Width and height [pixels].
-            bounds: Bounds of everything that will be drawn.
-            ground: Height of the floor [m]; None draws no floor.
-            camera: View from which pictures are taken.
+            bounds: Bounds of all drawn objects.
+            ground: Height of the floor [m]; None: no floor.
+            camera: View of the pictures.
         """
         self._pv = require_pyvista()
         self._bounds = bounds
@@ -140,7 +140,7 @@ class Stage:
         self._plotter.close()
 
     def add_goal(self, goal: Goal) -> None:
-        """Show a target shape, translucent and with its border."""
+        """Show a translucent target shape with its border."""
         shape = self._pv.PolyData.from_regular_faces(goal.vertices, goal.faces)
         self._plotter.add_mesh(shape, color=GOAL_COLOR, opacity=0.25, lighting=False)
         border = shape.extract_feature_edges(
@@ -154,13 +154,13 @@ class Stage:
     def draw(
         self, positions: Points, bodies: Sequence[Points], arrows: Points | None = None
     ) -> Image:
-        """Take one picture.
+        """Draw one picture.
 
         Args:
             positions: Cloth vertices [m], shape [N, 3].
             bodies: Vertices of each body or link [m], shape [v, 3].
-            arrows: Arrows that end at the vertices of the bodies and links [m], one body after the
-                other, shape [V, 3].
+            arrows: Arrows that end at the vertices of the bodies and links [m], body by body, shape
+                [V, 3].
 
         Returns:
             Colors of the pixels, shape [height, width, 3].
@@ -179,7 +179,7 @@ class Stage:
         if self._floor is not None:
             self._shadow.cast(casters)
         self._plotter.reset_camera_clipping_range()
-        self._plotter.render()  # otherwise a screenshot would show the last picture again
+        self._plotter.render()  # otherwise a screenshot would show the previous picture
         image = self._plotter.screenshot(return_img=True)
         return np.ascontiguousarray(image[..., :3])
 
@@ -195,7 +195,7 @@ class Stage:
         self._plotter.add_mesh(shapes, name="arrows", color=FORCE_COLOR, ambient=0.5)
 
     def _light(self, view: Points) -> Points:
-        """Add the lights for a direction of view; return the direction to the one with shadows."""
+        """Add the lights for a direction of view; return the direction to the shadow light."""
         low, high = self._bounds
         center, size = (low + high) / 2, float(np.linalg.norm(high - low))
         azimuth = np.arctan2(-view[0], view[1])

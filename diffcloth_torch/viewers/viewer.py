@@ -16,7 +16,7 @@ class Viewer(Protocol):
     """Receives states in the order of time; a context manager that finishes its files."""
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
-        """Take one state, without a batch axis, and the gradient of a loss by its positions."""
+        """Show one state, without a batch axis, and the gradient of a loss by its positions."""
         ...
 
     def __enter__(self) -> Viewer: ...
@@ -36,7 +36,7 @@ class NullViewer:
         """Do nothing."""
 
     def __enter__(self) -> NullViewer:
-        """Have nothing to open."""
+        """Return the viewer; nothing needs to be opened."""
         return self
 
     def __exit__(
@@ -45,4 +45,4 @@ class NullViewer:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Have nothing to finish."""
+        """Do nothing."""

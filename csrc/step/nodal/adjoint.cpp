@@ -1,10 +1,11 @@
 // The adjoint of dry frictional contact at nodes, in the terms of nodal/system.cpp.
 //
-// For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
-// the cotangents of the forces g at nodes, which act on cloths, bodies and pins. Then z = L^T lambda - eta goes through the
-// potentials as in schemes/contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
+// For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta the
+// cotangents of the forces g at nodes, which act on cloths, bodies and pins. Then z = L^T lambda - eta
+// is pulled back through the potentials as in schemes/contact_adjoint.cpp. The cotangent of
+// E (x - x_n) - h s v_out  at fixed g is minus
 //
-//   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P where it sticks)
+//   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P in a sticking contact)
 //
 // and the cotangents of the frame are
 //
@@ -28,12 +29,12 @@ using projective::NodalContact;
 
 namespace {
 
-/// Cotangents that the forces pull back: on nodes E^T E g, on the bodies minus E g, shared by the corners of the
-/// nearest faces, on pins g.
+/// Cotangents that the forces pull back: E^T E g at nodes; minus E g at bodies, shared by the corners of
+/// the nearest faces; g at pins.
 struct ForcesBar {
-  Array eta;                            ///< of the rows
-  std::vector<Vec3> surface_point_bar;  ///< of each contact
-  bool any;                             ///< whether any of them is not zero
+  Array eta;                            ///< cotangents at the rows
+  std::vector<Vec3> surface_point_bar;  ///< cotangent of each contact
+  bool any;                             ///< true if any of these is not zero
 };
 
 ForcesBar pull_back_forces(const Problem& problem,
@@ -92,7 +93,8 @@ Vec3 pull_back_slipping(const Problem& problem,
          c.normal.dot(q_held) * (problem.h * scale(c)) * at.u[k];
 }
 
-/// Cotangents of the poses of obstacles: a contact depends on them beyond the vertices of its body.
+/// Cotangents of the poses of obstacles: a contact depends on poses as well as on the vertices of its
+/// body.
 struct PoseCotangents {
   Array start;  ///< [7 T]
   Array end;    ///< [7 T]
@@ -103,7 +105,7 @@ struct PoseCotangents {
   }
 };
 
-/// Pull back to the contacts' frames, and to the positions and poses that these depend on.
+/// Pull back to the contacts' frames, and to the positions and poses on which the frames depend.
 void pull_back_frames(Problem& problem,
                       const NodalContacts& contacts,
                       const NodalSystem& system,

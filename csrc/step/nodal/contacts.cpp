@@ -16,8 +16,8 @@ using projective::Obstacle;
 
 namespace {
 
-/// Couplings of rows of which one is in contact with another vertex: the eliminated unknowns of a pair
-/// couple all neighbors of both.
+/// Couplings of rows near vertices in contact with each other: the eliminated unknowns of a pair couple
+/// all neighbors of both vertices.
 class PairPattern final : public Potential {
  public:
   PairPattern(const linalg::BlockPattern& base,
@@ -64,7 +64,7 @@ double pair_friction(const Problem& p, Index a, Index b) {
   return 0.5 * (mu.data[a * surfaces + b] + mu.data[b * surfaces + a]);
 }
 
-/// Report whether two surfaces may touch: pairs that the user ignores do not.
+/// True if two surfaces may touch: pairs that the user ignores may not.
 bool may_touch(const Problem& p, Index a, Index b) {
   const std::array<Index, 2> pair{std::min(a, b), std::max(a, b)};
   return std::ranges::find(p.scene.given.ignored_pairs, pair) == p.scene.given.ignored_pairs.end();
@@ -93,7 +93,7 @@ std::vector<Obstacle> make_obstacles(const Problem& p) {
   return obstacles;
 }
 
-/// How the vertices of cloths touch each other; absent where none may.
+/// Contact between vertices of cloths; absent if none is possible.
 std::optional<projective::Touching> make_touching(const Problem& p) {
   const Scene& scene = p.scene;
   if (scene.scheme().has_barrier) return {};

@@ -9,8 +9,8 @@
 
 namespace diffcloth::step {
 
-/// Contacts of a stage with contact at nodes: found once, on the straight way from x_n to the
-/// inertial prediction.
+/// Contacts of a stage with contact at nodes: found once, on the straight path from x_n to the inertial
+/// prediction.
 struct NodalContacts {
   explicit NodalContacts(Problem& problem);
 
@@ -18,10 +18,10 @@ struct NodalContacts {
   std::vector<projective::NodalContact> list;
   std::vector<Index> partner;            ///< [N] vertex in contact with each, or -1
   std::vector<double> inertia;           ///< [N] rho, see nodal/system.cpp [kg]
-  std::unique_ptr<Potential> couplings;  ///< of pairs, without energy; null without pairs
+  std::unique_ptr<Potential> couplings;  ///< couplings of pairs, without energy; null without pairs
 };
 
-/// The cloths on that way.
+/// The cloths on that path.
 projective::Swept swept(const Problem& problem);
 
 }  // namespace diffcloth::step

@@ -19,7 +19,7 @@ Array solve_derivative(const NodalSystem& system,
                        const Array& b) {
   Array w;
   if (!system.solve(at, H, S, transposed, b, kNodal.derivative_tolerance, w).converged) {
-    // Rounding may lie above the tolerance: then a larger residual is accepted.
+    // Rounding may exceed the tolerance; a larger residual is then accepted.
     Array again;
     if (!system.solve(at, H, S, transposed, b, kNodal.largest_derivative_error, again).converged) {
       throw std::domain_error("a derivative of nodal friction did not converge");

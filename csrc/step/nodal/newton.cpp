@@ -1,23 +1,23 @@
-// How a stage with dry friction at nodes is solved.
+// Newton's method for a stage with dry friction at nodes.
 //
-// Newton's method on the equations of nodal/system.cpp is quick where it knows the case of each contact,
-// but between cases its residual is no measure of the way to go: steps that reduce it, and steps that
-// do not, may go round in circles. So it is taken at its word only where it contracts the residual below
-// all that was seen before. Else an energy leads. With friction as large as some impulses allow the step
-// minimizes
+// Newton's method on the equations of nodal/system.cpp converges fast once the case of each contact is
+// known. Between cases, however, its residual is no merit function: steps that reduce the residual, and
+// steps that do not, may cycle. A Newton step is therefore accepted only if it contracts the residual
+// below all previous ones; otherwise an energy decides. With friction bounded by given impulses, the
+// step minimizes
 //
 //   E_r(x) = energy + sum mu r_n |u_T|     over  n . u >= 0,
 //
-// and its solutions are the x that minimize E_r for their own impulses r. Two ways lead down:
+// and its solutions are the x that minimize E_r for their own impulses r. Two kinds of steps descend:
 //
-//   * Newton's step on E_r with the impulses and the cases at hand, which costs no more than one of those
+//   * Newton's step on E_r with the current impulses and cases, at the cost of one of the Newton steps
 //     above;
-//   * after some of these, or where they lead nowhere, the solution of the whole law at the linearized
-//     forces. It decides on all cases at once, and minimizes E_r to second order for its own r, so that
-//     it goes down wherever it is not zero.
+//   * after some of these, or if they fail, the solution of the whole law at the linearized forces. This
+//     solution decides on all cases at once and minimizes E_r to second order for its own r, so that it
+//     is a descent direction unless it is zero.
 //
-// Where the Hessian is indefinite these would crawl past a saddle of E_r, or end there: once their
-// steps shrink, the solver leaves along the most negative direction.
+// If the Hessian is indefinite, such steps would crawl past a saddle of E_r, or end there: once they
+// shrink, the solver leaves along the direction of most negative curvature.
 
 #include <algorithm>
 #include <cmath>
@@ -52,7 +52,7 @@ double largest(const Array& change) {
   return size;
 }
 
-/// One solve: where it stands, and the ways on from there.
+/// One solve: its current point and its kinds of steps.
 class NodalSolve {
  public:
   NodalSolve(const Problem& problem,
@@ -84,7 +84,7 @@ class NodalSolve {
   enum class Newton : std::uint8_t { kNoStep, kContracts, kArrived };
 
   solver::Outcome descend() {
-    outcome_.residual = kInfinity;  // until a step of Newton's method is there to measure
+    outcome_.residual = kInfinity;  // until the first Newton step
     for (;; ++context_.iterations) {
       context_.checkpoint->check();
       assemble();
@@ -123,14 +123,14 @@ class NodalSolve {
         linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
   }
 
-  /// Set `there` to where a fraction of a change of the rows leads.
+  /// Set `there` to a fraction of a change of the rows.
   void go(const Array& p, double alpha) {
     there_.x = here_.x;
     const std::size_t size = std::min(p.size(), there_.x.size());
     for (std::size_t a = 0; a < size; ++a) there_.x[a] += alpha * p[a];
   }
 
-  /// Remember how long a step is.
+  /// Store the length of a step.
   void measure(double step) {
     last_ = step;
     longest_ = std::max(longest_, step);
@@ -169,8 +169,8 @@ class NodalSolve {
     return step < goal_ ? arrive(solver::Criterion::kRounding) : Newton::kNoStep;
   }
 
-  /// A factor of the form that a Hessian takes, of H blended with as little of its projection as it
-  /// needs; null where nothing helps.
+  /// Factor of the form(Hessian), with the smallest blend of the projected Hessian that makes it
+  /// positive definite; null if none does.
   template <class Form>
   solver::Factor damped(Form&& form) {
     const linalg::BlockMatrix positive =
@@ -242,8 +242,8 @@ class NodalSolve {
 
   bool is_near_saddle() const { return !factor_ && last_ <= kNodal.shrunk * longest_; }
 
-  /// Along the most negative direction, to either side, from far to near: the first point that is
-  /// lower, and on while the next is lower still.
+  /// Move along the direction of most negative curvature, on both sides, from far to near: to the first
+  /// lower point, and further while the next is lower still.
   bool leave_saddle() {
     const Array p = solver::most_negative(f_, linear_, *context_.checkpoint, *S_);
     if (p.empty()) return false;
@@ -262,7 +262,7 @@ class NodalSolve {
     }
     if (!(best < 0.0)) return false;
     change(p, best_alpha, frozen);
-    // Whatever was seen before belongs to the saddle.
+    // The history belongs to the saddle.
     last_ = least_ = kInfinity;
     longest_ = 0.0;
     descents_ = 0;
@@ -282,14 +282,14 @@ class NodalSolve {
   NodalSystem::Point there_;
   std::unique_ptr<const linalg::BlockMatrix> H_;  // exact, at `here`
   std::unique_ptr<const linalg::BlockMatrix> S_;  // see nodal/system.cpp
-  solver::Factor factor_;                         // of S; null where it is indefinite
+  solver::Factor factor_;                         // factor of S; null if indefinite
   Array constraint_step_;
 
   double blend_ = 0.0;
-  int descents_ = 0;          // by cases, since Newton's method last had its way
-  double least_ = kInfinity;  // of the residuals where S is definite
+  int descents_ = 0;          // descents by cases since the last successful Newton step
+  double least_ = kInfinity;  // smallest residual with a definite S
   double last_ = kInfinity;   // length of the last step [m]
-  double longest_ = 0.0;      // of all steps so far [m]
+  double longest_ = 0.0;      // longest step so far [m]
 };
 
 }  // namespace

@@ -16,7 +16,7 @@ using Array = std::vector<double>;
 using projective::ContactCase;
 using projective::NodalContact;
 
-/// Detects that residuals no longer halve now and then.
+/// Detects stalled residuals: none has halved for a number of iterations.
 class Progress {
  public:
   bool has_ended(double residual) {
@@ -33,7 +33,7 @@ class Progress {
   int idle_ = 0;
 };
 
-/// From the gradient of the smooth potentials to the force that the impulses leave.
+/// Replace the gradient of the smooth potentials by the force that remains with the impulses.
 void subtract_impulses(const Problem& problem,
                        const NodalContacts& contacts,
                        const NodalSystem& system,
@@ -66,7 +66,7 @@ void NodalStage::start(Array& x) const {
     const Vec3 r = projective::coulomb(-m * u, c.normal, c.friction).impulse;
     spread(c, problem_.h * scale(c) / m * r, x.data());
   }
-  // Where that would collapse the cloth, where it stands is the better place to begin.
+  // If these impulses would collapse the cloth, the held start is the better initial iterate.
   Array held = problem_.predicted(problem_.start.data());
   system.clear_approach(held);
   if (f.energy_change(x.data(), held.data()) < 0.0) x = std::move(held);
@@ -85,7 +85,7 @@ projective::LocalGlobalOutcome NodalStage::iterate(const projective::LocalGlobal
   Array force(problem_.cloth_size);
   Array p(problem_.cloth_size);
   Array q(problem_.cloth_size);
-  Array plain(problem_.cloth_size);  // where the last iteration leads without acceleration
+  Array plain(problem_.cloth_size);  // result of the last iteration without acceleration
   Array to = x;
   double last = std::numeric_limits<double>::infinity();
   Progress progress;
@@ -121,7 +121,7 @@ projective::LocalGlobalOutcome NodalStage::iterate(const projective::LocalGlobal
       size += p[a] * q[a];
     }
     if (accelerated && size > last) {
-      // Acceleration has led astray: go on from where the plain iteration leads.
+      // Acceleration has failed: continue from the result of the plain iteration.
       anderson = projective::Anderson(problem_.cloth_size);
       std::ranges::copy(plain, x.begin());
       accelerated = false;

@@ -11,7 +11,7 @@ namespace diffcloth::step {
 
 /// The stage of a scheme that has dry frictional contact at nodes: inertia, elasticity and anchors,
 /// with the law of Signorini and Coulomb at each node in contact (the paper's Eqs. 3-5). Contacts are
-/// found once, on the straight way from x_n to the inertial prediction.
+/// found once, on the straight path from x_n to the inertial prediction.
 ///
 /// See nodal/system.cpp for the equations, nodal/adjoint.cpp for their adjoint.
 class NodalStage {
@@ -22,7 +22,8 @@ class NodalStage {
 
   bool has_contacts() const { return !contacts_.list.empty(); }
 
-  /// Where a solve begins: every vertex flies freely, and those in contact obey the law on their own.
+  /// Initial iterate of a solve: every vertex flies freely; vertices in contact obey the law
+  /// independently.
   ///
   /// @param x  in: all points at the inertial prediction, prescribed ones at their ends
   void start(std::vector<double>& x) const;
@@ -32,8 +33,8 @@ class NodalStage {
   /// @param x  in: a start; out: the solution
   solver::Outcome solve(solver::Context& context, std::vector<double>& x) const;
 
-  /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated. They are given up
-  /// where they stall.
+  /// Solve by accelerated local/global iterations with impulses (Ly et al. 2020), which are given up if
+  /// they stall.
   ///
   /// @param smooth  the objective without contact
   /// @param x  in: a start; out: the solution
@@ -42,25 +43,25 @@ class NodalStage {
                                          const Checkpoint& checkpoint,
                                          std::vector<double>& x) const;
 
-  /// Count the cases of the law at a solution, and add the forces there; those on the bodies' vertices
+  /// Count the cases of the law at a solution, and add the forces there; forces on the bodies' vertices
   /// are minus the forces on the nodes, shared by the corners of the nearest faces.
   void finish(const std::vector<double>& x, Report& report, const Forces& forces) const;
 
   /// The adjoint, for a solution x.
   ///
-  /// @param factor  as solve() gave it, or null to recompute it
+  /// @param factor  from solve(), or null to recompute it
   /// @param g       cotangent of the rows at the end
-  /// @param bars    of the loss whose turn it is
+  /// @param bars    of the current loss
   void backward(const Backward& step,
                 const std::vector<double>& x,
                 solver::Factor factor,
                 const std::vector<double>& g,
                 Cotangents& bars) const;
 
-  /// Change of all points along a direction, for a solution x, and of the forces there, which is added. The
-  /// potentials have the tangents of the direction.
+  /// Change of all points along a direction, for a solution x; the change of the forces is added to the
+  /// step's. The potentials have the tangents of the direction.
   ///
-  /// @param factor  as solve() returned it, or null to recompute it
+  /// @param factor  from solve(), or null to recompute it
   std::vector<double> tangent(const Pushforward& step,
                               const std::vector<double>& x,
                               solver::Factor factor,

@@ -7,26 +7,26 @@
 //   impulse            r = h s E g(x)          (no other force acts along E: the step's momentum)
 //   relative velocity  u = E (x - x_n) / (h s) - v_out,
 //
-// and (r, u) obey the law of Signorini and Coulomb: r = Phi(r - rho u), see projective/coulomb.h; which
-// masses rho > 0 has no influence on the solution, and h^2 times the diagonal of the constant
-// matrix M / h^2 + L predicts its cases well. So the impulses are no unknowns. Elsewhere g = 0. Let P =
-// I - n n^T. The equations along E of each case are
+// and (r, u) obey the law of Signorini and Coulomb: r = Phi(r - rho u), see projective/coulomb.h. The
+// choice of masses rho > 0 has no influence on the solution; h^2 times the diagonal of the constant
+// matrix M / h^2 + L predicts its cases well. The impulses are therefore no unknowns. At all other
+// nodes, g = 0. Let P = I - n n^T. The equations along E of each case are
 //
 //   taking off   E g = 0
 //   sticking     u = 0
 //   slipping     n . u = 0,   P E g - mu (n . E g) t = 0,   t = -u_T / |u_T|.
 //
-// Let Z project onto the subspace that no constraint holds (E^T P E of slipping nodes, nothing of sticking ones),
-// L = Z - sum mu E^T t n^T E, and F = sum k E^T (P - t t^T) E with k = mu r_n / (h^2 s^2 |u_T|): friction
-// turns with the slip. With the Hessian H of the energy, a change w = Z w of the free part changes the
-// equations by
+// Let Z project onto the subspace that no constraint holds (E^T P E of slipping nodes, zero for sticking
+// nodes), L = Z - sum mu E^T t n^T E, and  F = sum k E^T (P - t t^T) E  with k = mu r_n / (h^2 s^2
+// |u_T|), as friction turns with the slip. With the Hessian H of the energy, a change w = Z w of the
+// free part changes the equations by
 //
 //   K w = L H w + F w.
 //
-// K is not symmetric, but S = Z H Z + F + (I - Z) rho / h^2 is: the system without the coupling of friction
-// and normal force. It has the pattern of H, its Cholesky factor preconditions GMRES, and shows that
-// the solution is a minimum where the friction is frozen. Off the solution the same operators, with t and k
-// of s = r - rho u, define a semismooth Newton method.
+// K is not symmetric, but S = Z H Z + F + (I - Z) rho / h^2 is: the system without the coupling of
+// friction and normal force. S has the pattern of H; its Cholesky factor preconditions GMRES, and proves
+// that the solution is a minimum for frozen friction. Away from the solution the same operators, with t
+// and k of s = r - rho u, define a semismooth Newton method.
 
 #include "step/nodal/system.h"
 
@@ -329,7 +329,7 @@ double NodalSystem::frozen_energy_change(const Point& at,
 
 namespace {
 
-/// Z by blocks: Z_pp and, in pairs, Z_p'p of each vertex p; it is the identity where no contact is.
+/// Z by blocks: Z_pp and, in pairs, Z_p'p of each vertex p; the identity at vertices without contact.
 class Projections {
  public:
   Projections(const std::vector<NodalContact>& contacts,
@@ -356,7 +356,7 @@ class Projections {
   bool holds(Index p) const { return place_[p] >= 0; }
   const Mat3& own(Index p) const { return blocks_[place_[p]].own; }
 
-  /// Rows that Z takes a vertex to: itself, and its partner; -1 where there is none.
+  /// Rows to which Z maps a vertex: itself, and its partner; -1 if there is none.
   std::array<std::pair<Index, Mat3>, 2> images(Index p) const {
     std::array<std::pair<Index, Mat3>, 2> rows{std::pair{p, Mat3(Mat3::Identity())},
                                                std::pair{Index{-1}, Mat3(Mat3::Zero())}};
@@ -372,11 +372,11 @@ class Projections {
     Mat3 other;
   };
   const std::vector<Index>& partner_;
-  std::vector<Index> place_;  // of each vertex among the blocks
+  std::vector<Index> place_;  // index of each vertex's block
   std::vector<Block> blocks_;
 };
 
-/// A block of H that has left its place.
+/// A block of H that was removed from the matrix, to be projected.
 struct Moved {
   Index p, q;
   Mat3 block;
@@ -406,7 +406,7 @@ std::vector<Moved> project_in_place(const Projections& Z,
   return moved;
 }
 
-/// Bring a block back, projected, where both of its vertices are taken to.
+/// Add a removed block, projected, at all images of its two vertices.
 void add_projected(const Projections& Z,
                    const std::vector<char>& fixed,
                    const Moved& m,
@@ -414,7 +414,7 @@ void add_projected(const Projections& Z,
   for (const auto& [a, Z_a] : Z.images(m.p)) {
     for (const auto& [b, Z_b] : Z.images(m.q)) {
       if (a < 0 || b < 0) continue;
-      // Rows of fixed points are no part of the matrix, nor in its pattern beyond the base.
+      // Rows of fixed points are not part of the matrix, and their pattern is the base pattern.
       if ((fixed[a] != 0 || fixed[b] != 0) && (a != m.p || b != m.q)) continue;
       const Mat3 block = Z_a * m.block * Z_b.transpose();
       if (m.p == m.q) {

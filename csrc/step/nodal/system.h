@@ -42,7 +42,7 @@ class NodalSystem {
   /// The equations at a point.
   struct Point {
     std::vector<double> x;
-    std::vector<double> g;  ///< of all points
+    std::vector<double> g;  ///< gradient at all points
     std::vector<projective::Coulomb> laws;
     std::vector<Vec3> u;  ///< relative velocities [m/s]
     double merit = 0.0;   ///< sum of |residual|^2 / rho [J]
@@ -54,7 +54,7 @@ class NodalSystem {
 
   Vec3 velocity(const projective::NodalContact& c, const std::vector<double>& x) const;
 
-  /// The held part of e at this case of the law: I - P, or all, or nothing.
+  /// The part of e that this case of the law holds: I - P, or all, or nothing.
   static Vec3 held(const projective::NodalContact& c,
                    const projective::Coulomb& law,
                    const Vec3& e);
@@ -69,7 +69,7 @@ class NodalSystem {
 
   void clear_fixed(std::vector<double>& v) const;
 
-  /// H v at all rows. The matrix of the fixed ones has elasticity alone: see linalg/block_matrix.h.
+  /// H v at all rows. Rows of fixed points have elasticity alone: see linalg/block_matrix.h.
   std::vector<double> hessian_product(const Point& at, const std::vector<double>& v) const;
 
   /// v = L v.
@@ -98,7 +98,7 @@ class NodalSystem {
 
   /// Minus the equations at the free parts, and minus their change by the constraints' step d.
   ///
-  /// @param frozen  with friction as large as it is now, whatever becomes of the normal forces
+  /// @param frozen  with the current magnitude of friction, independent of changes of the normal forces
   std::vector<double> right_side(const Point& at,
                                  const linalg::BlockMatrix& H,
                                  const std::vector<double>& d,
@@ -107,14 +107,14 @@ class NodalSystem {
   /// Move points that approach their obstacle back until they do not; return whether there were any.
   bool clear_approach(std::vector<double>& x) const;
 
-  /// A change of the rows, and the impulses along the way [N s].
+  /// A change of the rows, and the impulses during it [N s].
   struct Linearized {
     std::vector<double> p;
     std::vector<Vec3> impulses;
   };
 
-  /// Solve the law of all contacts at once, with forces g + H p for a change p of the rows. It takes
-  /// 72 m^2 bytes and 3 m solves with H for m contacts.
+  /// Solve the law of all contacts at once, with forces g + H p for a change p of the rows. For m
+  /// contacts, this needs 72 m^2 bytes and 3 m solves with H.
   Linearized solve_linearized(const Point& at, const linalg::CholeskyFactor& H) const;
 
   /// Change from one point to another of the energy with friction as large as impulses [N s] allow.
@@ -133,7 +133,7 @@ class NodalSystem {
 
 /// K^-1 b, or K^-T b, to rounding.
 ///
-/// @throws std::domain_error where rounding leaves too much of it
+/// @throws std::domain_error if rounding leaves too large a residual
 std::vector<double> solve_derivative(const NodalSystem& system,
                                      const NodalSystem::Point& at,
                                      const linalg::BlockMatrix& H,
@@ -143,14 +143,14 @@ std::vector<double> solve_derivative(const NodalSystem& system,
 
 /// The factor of S at a solution, recomputed if evicted.
 ///
-/// @throws std::domain_error where the solution is no minimum
+/// @throws std::domain_error if the solution is no minimum
 solver::Factor certified(const NodalSystem& system,
                          solver::LinearSystem& linear,
                          const NodalSystem::Point& at,
                          const linalg::BlockMatrix& H,
                          solver::Factor factor);
 
-/// Places of a contact's two surfaces among the coefficients of friction of all pairs, in both orders.
+/// Indices of a contact's two surfaces among the coefficients of friction of all pairs, in both orders.
 std::array<std::size_t, 2> friction_entries(const Problem& problem,
                                             const NodalContacts& contacts,
                                             const projective::NodalContact& contact);

@@ -1,15 +1,15 @@
 // The tangent of dry frictional contact at nodes, in the terms of nodal/system.cpp.
 //
-// The held part of the change of x follows from  E (x - x_n) = h s v_out  there: with the tangents of all that
-// the frame depends on,
+// The held part of the change of x follows from  E (x - x_n) = h s v_out  there: with the tangents of
+// all quantities on which the frame depends,
 //
-//   a = E x_n' + h s v_out',   d = E^T a where it sticks,   d = E^T n (n . a - h s n' . u) where it slips,
+//   a = E x_n' + h s v_out',   d = E^T a when sticking,   d = E^T n (n . a - h s n' . u) when slipping,
 //
 // and d is given at pins. The free part w = Z w solves  K w = -Z b,
 //
 //   b = L (H d + d/d(theta) g theta') - E^T (F_E a + (n . E g) n' + (mu' (n . E g) + mu n' . E g) t),
 //
-// F_E being k (P - t t^T), where it slips. Then x' = d + w, and g' = H x' + d/d(theta) g theta'.
+// F_E being k (P - t t^T) for slipping contacts. Then x' = d + w, and g' = H x' + d/d(theta) g theta'.
 
 #include <algorithm>
 #include <utility>
@@ -58,7 +58,7 @@ std::vector<FrameTangent> push_forward_frames(const Problem& problem,
   return result;
 }
 
-/// How the equations of a slipping contact change with its frame and its friction, at fixed g.
+/// Tangent of the equations of a slipping contact by its frame and its friction, at fixed g.
 Vec3 slipping_tangent(const NodalContact& c,
                       const Coulomb& law,
                       const Vec3& force,

@@ -23,7 +23,7 @@ double half_density(const Problem& p) {
   return density != nullptr ? 0.5 * *density : 0.0;
 }
 
-/// Drag of second-order steps acts on the mean velocity, as their velocities are half a step before the positions.
+/// Drag of second-order steps acts on the mean velocity, as velocities are half a step before positions.
 bool takes_mean(const Problem& p) { return p.scene.given.integrator == Integrator::kSecondOrder; }
 
 bool wants_coefficients(const Gradients* wanted) {

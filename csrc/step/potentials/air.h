@@ -11,7 +11,7 @@ namespace diffcloth::step {
 /// air and the coefficients C_n across and C_t along the faces. See air/drag_potential.h.
 class Air final : public StepPotential {
  public:
-  /// @param wanted  whose cotangents are wanted; null: nobody's
+  /// @param wanted  requested gradients; null: none
   Air(const Problem& problem, const Gradients* wanted);
 
   air::DragPotential& potential() override { return potential_; }

@@ -11,7 +11,7 @@
 namespace diffcloth::step {
 namespace {
 
-/// An input with one value a face, and where models and their cotangents have it.
+/// An input with one value a face, and its members in models and their cotangents.
 struct FaceValue {
   Input input;
   std::vector<double> elastic::Model::* value;

@@ -9,7 +9,7 @@ namespace diffcloth::step {
 /// Stretch, bending and damping of the cloths.
 class Elasticity final : public StepPotential {
  public:
-  /// @param wanted  whose cotangents are wanted; null: nobody's
+  /// @param wanted  requested gradients; null: none
   Elasticity(const Problem& problem, const Gradients* wanted);
 
   elastic::ElasticPotential& potential() override { return potential_; }
@@ -20,7 +20,7 @@ class Elasticity final : public StepPotential {
 
   const elastic::Model& model() const { return model_; }
 
-  /// Take the start of damping from other positions, which outlive this.
+  /// Set the start of damping to other positions, which must outlive this object.
   ///
   /// @param start  [N, 3] [m]
   void begin_at(const Problem& problem, const double* start);

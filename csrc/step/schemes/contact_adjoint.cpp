@@ -1,31 +1,31 @@
 // The adjoint of a step.
 //
-// Let E_k be the objective of friction iteration k = 1..K, x_k its minimizer over the free vertices,
-// and grad the gradient over *all* vertices: free, pinned and bodies'. The outputs are x_K,
-// v = (x_K - x_n)/h and the forces f_o = -grad_o E_K at fixed x_K (bodies' rows). For cotangents
-// x_bar, v_bar, f_bar (forces on pins, grad_p E_K, have rows of zhat likewise, with the other sign; to
-// those on the cloths' vertices, -grad of barrier and friction alone, the last lines come back):
+// Let E_k be the objective of friction iteration k = 1..K, x_k its minimizer over the free vertices, and
+// grad the gradient over *all* vertices: free, pinned and bodies'. The outputs are x_K, v = (x_K -
+// x_n)/h and the forces f_o = -grad_o E_K at fixed x_K (bodies' rows). For cotangents x_bar, v_bar,
+// f_bar (forces on pins, grad_p E_K, have rows of zhat likewise, with the opposite sign; for forces on
+// the cloths' vertices, -grad of barrier and friction alone, see the last lines):
 //
 //   g_K   = x_bar + v_bar / h
 //   z_k   = H_k^-1 (g_k - H_xo f_bar [k = K])      at the free vertices
 //   zhat  = (z_k, 0 at pins, f_bar at bodies [k = K, else 0])
 //
-// Then every input theta that E_k depends on, whether through the solution or through the forces,
-// gets the same expression,
+// Then every input theta of E_k, which may act through the solution or through the forces, gets the same
+// expression,
 //
 //   theta_bar -= d/d(theta) ( zhat . grad E_k ),
 //
-// which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
-// o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement from x_start gives
-// x_start_bar, or the cotangent of the origins if these are given. Contact forces with cotangent c_bar on
-// the cloths' vertices are like another f_bar of the objective C = barrier + friction: g_K loses H_C c_bar,
-// and C is pulled back at zhat + c_bar. The lag configuration of k is x_{k-1}
-// (x_n for k = 1): its cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
+// which each potential accumulates for its own inputs; in particular prescribed positions (pins c,
+// bodies o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement from
+// x_start yields x_start_bar, or the cotangent of the origins if these are given. Contact forces with
+// cotangent c_bar on the cloths' vertices are like another f_bar of the objective C = barrier +
+// friction: g_K loses H_C c_bar, and C is pulled back at zhat + c_bar. The lag configuration of k is
+// x_{k-1} (x_n for k = 1): its cotangent becomes g_{k-1}, and the sweep continues from K to 1.
 //
-// Where vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
-// dy = J dz, H includes the second derivative of  y . grad_y E_k  by q, and zhat has J z_k at those
-// vertices besides f_bar. Prescribed joints and frames are like pins: of  zhat . grad E_k  they get
-// -J_s^T (H zhat) and, as J itself depends on them,  -d/ds (J z_k) . grad_y E_k.
+// If vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
+// with  dy = J dz;  H includes the second derivative of  y . grad_y E_k  by q, and zhat has J z_k at
+// those vertices besides f_bar. Prescribed joints and frames are treated like pins: from  zhat . grad
+// E_k  they get  -J_s^T (H zhat)  and, as J itself depends on them,  -d/ds (J z_k) . grad_y E_k.
 
 #include <algorithm>
 #include <utility>
@@ -39,11 +39,11 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Cotangents of the forces that are a gradient of the whole objective, whose sign bodies feel turned.
+/// Cotangents of the forces that are a gradient of the whole objective; its sign is reversed for bodies.
 ///
-/// @param with_bodies  whether the forces on bodies are among them
+/// @param with_bodies  true to include the forces on bodies
 /// @param out          [points, 3], zero
-/// @return whether there are any
+/// @return true if any cotangent is not zero
 bool read_held_forces(const Backward& step, std::size_t l, bool with_bodies, Array& out) {
   const Cotangents& bars = step.losses[l];
   const bool bodies = with_bodies && !is_zero(bars.body_forces);
@@ -133,13 +133,13 @@ void pull_back_solve(const Backward& step,
 
 namespace {
 
-/// The cotangent of where friction counts motion from.
+/// The cotangent of the origins of friction's displacements.
 void add_start(const Array& start_bar, Cotangents& bars) {
   Array& bar = bars.origins.empty() ? bars.start : bars.origins;
   for (std::size_t a = 0; a < start_bar.size(); ++a) bar[a] += start_bar[a];
 }
 
-/// The cotangent of the lag configuration: of the start, or of the rows g of the solve before.
+/// The cotangent of the lag configuration: of the start, or of the rows g of the previous solve.
 void add_lag(const Problem& problem,
              const Array& x_lag,
              bool is_start,
@@ -153,7 +153,7 @@ void add_lag(const Problem& problem,
   lag_bar.resize(x_lag.size(), 0.0);
   problem.coordinates.gather(x_lag, lag_bar);
   problem.coordinates.take_rows(lag_bar, g);
-  // The rest is prescribed and no row: bodies and frames.
+  // All other points are prescribed and have no rows: bodies and frames.
   problem.coordinates.clear_rows(lag_bar);
   for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
 }
@@ -162,7 +162,7 @@ void add_lag(const Problem& problem,
 
 void ContactStage::backward(const Backward& step, std::vector<Array> g) {
   Problem& problem = step.problem;
-  // Cotangents of barrier and friction, of the loss whose turn it is.
+  // Cotangents of barrier and friction of the current loss.
   contact::ContactModel::Bar contact_bar(problem.scene.collision_mesh);
   ContactSum sum(potentials(), problem, step.detection, step.friction ? &contact_bar : nullptr,
                  step.barrier ? &contact_bar : nullptr);

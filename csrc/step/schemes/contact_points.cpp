@@ -11,18 +11,18 @@ namespace {
 
 using contact::Contact;
 
-/// Two features: against bodies, those that are nearest.
+/// Key of two features; against bodies, of the nearest ones.
 using Features = std::pair<contact::Candidate, std::array<Index, 4>>;
 
 Features features(const Contact& contact) { return {contact.pair, contact.pair.vertices}; }
 
-/// Where the points of features are in a list, which have no two points with the same.
+/// Index of the point of each pair of features in a list without duplicate pairs.
 class Places {
  public:
   explicit Places(const std::vector<Contact>& contacts) : contacts_(contacts) {}
 
-  /// The place of a contact's features, and a new one at the end where there is none. Solutions follow each other
-  /// closely: most are where one expects them behind the last one, and the others are looked up.
+  /// Index of a contact's features; `end` for a new point. Successive solutions are similar: most
+  /// contacts are found directly after the previous one, and the others are looked up.
   std::size_t find(const Contact& contact, std::size_t end) {
     if (next_ < contacts_.size() && features(contacts_[next_]) == features(contact)) {
       return next_++;
@@ -40,10 +40,11 @@ class Places {
  private:
   const std::vector<Contact>& contacts_;
   std::size_t next_ = 0;
-  std::map<Features, std::size_t> by_features_;  // filled when the first one is looked up
+  std::map<Features, std::size_t> by_features_;  // filled at the first lookup
 };
 
-/// Where a pair is, with the surface of the smaller index first; and whether that is its second one.
+/// The point of a pair, with the smaller surface index first; and true if that is the pair's second
+/// surface.
 std::pair<ContactPoint, bool> placed(const contact::ContactModel& model,
                                      const Contact& c,
                                      const double* x) {
@@ -65,7 +66,7 @@ std::pair<ContactPoint, bool> placed(const contact::ContactModel& model,
   const double distance = way.norm();
   point.normal = distance > 0.0 ? Vec3(way / distance) : Vec3(Vec3::Zero());
   point.gap = distance - c.xi;
-  // From the skeletons of round bodies to their skins.
+  // Move from the skeletons of round bodies to their surfaces.
   points[0] += model.mesh().radius[point.first] * point.normal;
   points[1] -= model.mesh().radius[point.second] * point.normal;
   return {point, is_turned};
@@ -97,7 +98,7 @@ std::vector<ContactPoint> contact_points(const Problem& problem,
     const auto [point, is_turned] = placed(model, entry.lag, x.data());
     const std::size_t place = places.find(entry.lag, points.size());
     if (place == points.size()) points.push_back(point);
-    // It acts against the motion of the pair's first feature relative to the second one.
+    // Friction opposes the motion of the pair's first feature relative to the second one.
     const Vec3 on_b = (entry.mu * entry.lambda) * slips[k].force();
     points[place].tangential_force += is_turned ? Vec3(-on_b) : on_b;
   }

@@ -8,14 +8,14 @@
 
 namespace diffcloth::step {
 
-/// Where surfaces touch at the end of a step, and with which forces: one for each pair of features that the
-/// barrier keeps apart there, in their order.
+/// Contact points and forces at the end of a step: one for each pair of features that the barrier keeps
+/// apart there, in the order of the pairs.
 ///
-/// Friction of a pair goes to its contact; friction of pairs that are no longer in contact, as it comes from
-/// the contacts of the last but one solution, has points of its own, without a normal force.
+/// Friction of a pair is added to its contact. Friction comes from the contacts of the previous solve;
+/// friction of pairs that are no longer in contact has points of its own, without a normal force.
 ///
 /// @param contacts  at the solution
-/// @param friction  null where there is none
+/// @param friction  null if there is none
 std::vector<ContactPoint> contact_points(const Problem& problem,
                                          const std::vector<contact::Contact>& contacts,
                                          const contact::FrictionSet* friction,

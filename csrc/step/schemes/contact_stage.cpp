@@ -64,8 +64,8 @@ std::string_view words(solver::Criterion criterion) {
   __builtin_unreachable();
 }
 
-/// Explain why a prescribed motion has ended, and name the surfaces near each other that stopped a step.
-/// Contacts do not show them: two prescribed surfaces have none, but block each other.
+/// Explain why a prescribed motion ended, and name the surfaces near each other that stopped a step.
+/// Contacts do not show them: two prescribed surfaces have no contacts, but block each other.
 void report_blockers(const Problem& problem,
                      const Array& x,
                      const solver::Outcome& outcome,
@@ -81,8 +81,8 @@ void report_blockers(const Problem& problem,
   if (!names.empty()) report.message += (is_infeasible ? "; in contact: " : ": ") + names;
 }
 
-/// Forces of contact on all vertices, minus the partial derivative of its energy, with those of
-/// attachments on bodies, and forces on pins.
+/// Forces of contact on all vertices, minus the partial derivative of its energy; forces of attachments
+/// on bodies; and forces on pins.
 void add_forces(const Problem& problem,
                 ContactSum& sum,
                 const Potential& attachments,
@@ -121,7 +121,8 @@ std::vector<Field> ContactStage::tape(const Scene& scene) {
   const std::size_t n = static_cast<std::size_t>(scene.cloth_vertex_count()) +
                         static_cast<std::size_t>(scene.mechanisms.node_count());
   const auto k = static_cast<std::size_t>(scene.given.friction_iterations);
-  // Numbers of contacts, at the start and after each solve, spare backward the search for none.
+  // With the numbers of contacts at the start and after each solve, backward need not search if there
+  // are none.
   return {{.name = "iterates", .shape = {k, n, 3}},
           {.name = "solves", .shape = {1}},
           {.name = "contacts", .shape = {k + 1}}};
@@ -147,7 +148,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     const Stopwatch::Scope scope(*step.context.watch, Phase::kAnalysis);
     sum.expect_contacts_near(problem.start);
   }
-  // Everything at its end, unknowns where inertia alone (or x^D) would put them.
+  // All points at the inertial guess (or x^D), prescribed ones at their ends.
   const Array first_guess = problem.predicted(guess);
   const solver::Departure departure{
       .motion = motion, .guess = problem.scene.given.begins_at_state ? nullptr : &first_guess};
@@ -169,7 +170,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     if (step.report.result != Result::kConverged) break;
     const std::vector<Contact>& contacts = sum.contacts();
     keep(solves, contacts);
-    // Without contact before and after, another solve would be the same one.
+    // Without contact before and after, another solve would repeat this one.
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(x, contacts);
   }

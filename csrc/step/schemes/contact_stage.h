@@ -10,21 +10,21 @@
 
 namespace diffcloth::step {
 
-/// Puts the tangents along a direction into the potentials of an objective but those that touch, for
-/// Potential::add_tangent().
+/// Puts the tangents along a direction into all potentials of an objective except contact and friction,
+/// for Potential::add_tangent().
 using SetTangents = std::function<void(std::size_t direction)>;
 
-/// The stage of a scheme that contact is part of: inertia (or nearness), whatever else, barrier and
-/// friction, minimized once for each friction iteration, with friction lagged at the solution before.
+/// The stage of a scheme with contact: inertia (or nearness), other potentials, barrier and friction,
+/// minimized once for each friction iteration, with friction lagged at the previous solution.
 struct ContactStage {
   Proximity& inertia;
-  const double* guess;  ///< where the cloths begin if the way there is free: all [N, 3] of them
+  const double* guess;  ///< initial iterate of the cloths if the path to it is free [N, 3]
   std::vector<Potential*> others;
   solver::PatternCache& patterns;
-  std::size_t first_factor;      ///< place of its factors among the scheme's
-  const Potential* attachments;  ///< of cloths to bodies, as they count here
-  Turn::Exchange exchange;       ///< of the cotangents of its potentials; only backward needs it
-  SetTangents set_tangents;      ///< of its potentials; only tangent needs it
+  std::size_t first_factor;      ///< index of its first factor among the scheme's
+  const Potential* attachments;  ///< springs between cloths and bodies, as weighted in this stage
+  Turn::Exchange exchange;       ///< cotangents of the stage's potentials; for backward only
+  SetTangents set_tangents;      ///< tangents of the stage's potentials; for tangent only
 
   /// Fields of the tape.
   static std::vector<Field> tape(const Scene& scene);
@@ -44,14 +44,14 @@ struct ContactStage {
   }
 };
 
-/// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp. All losses are
-/// solved for at once.
+/// zhat of one solve, and its pull back to everything but the lag: see contact_adjoint.cpp. All losses
+/// are solved for at once.
 ///
-/// @param x            all points where the objective has been minimized; its potentials stand there
-/// @param factor       of the exact Hessian there, or null to make it
+/// @param x            all points at the minimum of the objective; current point of its potentials
+/// @param certificate  of the exact Hessian there, or none to recompute it
 /// @param g            of each loss, cotangent of the rows
-/// @param with_forces  whether this solve yields the forces of the step
-/// @param touching     the potentials of the objective that contact forces are of
+/// @param with_forces  true if this solve yields the forces of the step
+/// @param touching     potentials of the objective that exert contact forces
 /// @param exchange     of the cotangents of the objective's potentials
 void pull_back_solve(const Backward& step,
                      const solver::Objective& objective,
@@ -62,14 +62,14 @@ void pull_back_solve(const Backward& step,
                      const std::vector<contact::TouchingPotential*>& touching,
                      const Turn::Exchange& exchange);
 
-/// How the solution of one solve changes along each direction: all points. See contact_tangent.cpp.
+/// Changes of all points at the solution of one solve along each direction. See contact_tangent.cpp.
 ///
-/// @param x             all points where the objective has been minimized; its potentials stand there
-/// @param certificate   of the exact Hessian there, or none to make it
-/// @param with_forces   whether this solve yields the forces of the step
-/// @param touching      the potentials of the objective that contact forces are of; the tangents along all
-///                      directions are in them
-/// @param set_tangents  of the other potentials
+/// @param x             all points at the minimum of the objective; current point of its potentials
+/// @param certificate   of the exact Hessian there, or none to recompute it
+/// @param with_forces   true if this solve yields the forces of the step
+/// @param touching      potentials of the objective that exert contact forces; they hold the tangents
+///                      along all directions
+/// @param set_tangents  sets the tangents of the other potentials
 std::vector<std::vector<double>> push_forward_solve(
     const Pushforward& step,
     const solver::Objective& objective,
@@ -79,7 +79,8 @@ std::vector<std::vector<double>> push_forward_solve(
     const std::vector<contact::TouchingPotential*>& touching,
     const SetTangents& set_tangents);
 
-/// Fold the outcome of one solve into the report: the criterion of the first that failed, else of the last.
+/// Merge the outcome of one solve into the report: the criterion of the first failed solve, else of the
+/// last.
 void merge(const solver::Outcome& outcome, Report& report);
 
 }  // namespace diffcloth::step

@@ -10,7 +10,7 @@
 
 namespace diffcloth::step {
 
-/// Potentials of a contact stage but barrier and friction, and the pattern of their Hessian.
+/// Potentials of a contact stage except barrier and friction, and the pattern of their Hessian.
 struct StagePotentials {
   Proximity& inertia;
   std::vector<Potential*> others;
@@ -20,7 +20,7 @@ struct StagePotentials {
 /// The potentials of one friction iteration of a stage.
 class ContactSum {
  public:
-  /// @param bar          where friction accumulates; null where it never does
+  /// @param bar          accumulates cotangents of friction; null if unused
   /// @param barrier_bar  likewise, the barrier
   ContactSum(const StagePotentials& stage,
              Problem& problem,
@@ -33,30 +33,30 @@ class ContactSum {
     objective.contact = contact_ ? &*contact_ : nullptr;
   }
 
-  /// Contacts at the start of a motion; the contact potential stands there.
+  /// Contacts at the start of a motion, which becomes the current point of the contact potential.
   const std::vector<contact::Contact>& contacts_at_start(const std::vector<double>& x) {
     if (contact_) contact_->stand_at_start(x.data());
     return contacts();
   }
 
-  /// Contacts at a point, found from scratch; the contact potential stands there.
+  /// Contacts at a point, searched from scratch; it becomes the current point of the contact potential.
   const std::vector<contact::Contact>& contacts_at(const std::vector<double>& x) {
     if (contact_) contact_->look_at(x.data());
     return contacts();
   }
 
-  /// Stand where these are the contacts; they outlive the stand.
+  /// Set the contacts of the contact potential without a search; they must outlive its use.
   void adopt(const std::vector<contact::Contact>& contacts) {
     if (contact_) contact_->adopt(contacts);
   }
 
-  /// Contacts where the contact potential stands.
+  /// Contacts at the current point of the contact potential.
   const std::vector<contact::Contact>& contacts() const {
     static const std::vector<contact::Contact> none;
     return contact_ ? contact_->contacts() : none;
   }
 
-  /// The potentials that contact forces are of.
+  /// The potentials that exert contact forces.
   std::vector<contact::TouchingPotential*> touching() {
     std::vector<contact::TouchingPotential*> potentials;
     if (objective.contact != nullptr) potentials.push_back(objective.contact);
@@ -64,8 +64,8 @@ class ContactSum {
     return potentials;
   }
 
-  /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
-  /// seldom change then, and remain functions of the point and this one.
+  /// Include the couplings of all contacts that are possible near a point in factors: patterns then
+  /// seldom change, and remain functions of the current point and this one.
   void expect_contacts_near(const std::vector<double>& x) {
     if (!contact_) return;
     linalg::Couplings points;
@@ -73,18 +73,18 @@ class ContactSum {
     objective.expect(std::move(points));
   }
 
-  /// Take friction from the contacts of a configuration.
+  /// Lag friction at a configuration and its contacts.
   void lag(const std::vector<double>& x, std::vector<contact::Contact> contacts) {
     friction.reset();
     own_lagged_ = std::move(contacts);
     lag_kept(x, own_lagged_);
   }
 
-  /// The same with contacts that outlive the friction.
+  /// Likewise, with contacts that outlive the friction.
   void lag_kept(const std::vector<double>& x, const std::vector<contact::Contact>& contacts) {
     objective.take_friction(nullptr);
     friction.reset();
-    // Where nothing can touch there are no contacts either.
+    // If nothing can touch, there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
     friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), x.data(), bar_);
     objective.take_friction(&*friction);

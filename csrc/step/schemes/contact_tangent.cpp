@@ -1,19 +1,20 @@
 // The tangent of a step, in the terms of contact_adjoint.cpp.
 //
-// At the minimizer x_k the gradient vanishes at the rows, J^T grad E_k = 0, and stays zero along a direction of
-// the inputs. Let d be the change of all points with the prescribed ones alone: pins, bodies, and vertices
-// of links with prescribed joints and frames, at fixed free coordinates. Then
+// At the minimizer x_k the gradient vanishes at the rows, J^T grad E_k = 0, and stays zero along a
+// direction of the inputs. Let d be the change of all points due to the prescribed ones alone: pins,
+// bodies, and vertices of links with prescribed joints and frames, at fixed free coordinates. Then
 //
 //   dx_k = d - J H_k^-1 (J^T b + C d),   b = H d + d/d(theta) (grad E_k) theta_dot,
 //
-// with H over all points, H_k the Hessian over the rows, and C d the change of J^T grad E_k with J along d. Every potential
-// adds the contribution of its own inputs to b; friction of k = 1..K also the contribution of the lag
-// configuration, whose change is dx_{k-1} (the change of the start for k = 1). The outputs change by
+// with H over all points, H_k the Hessian over the rows, and C d the change of J^T grad E_k with J along
+// d. Every potential adds the contribution of its own inputs to b; friction of k = 1..K also the
+// contribution of the lag configuration, whose change is dx_{k-1} (the change of the start for k = 1).
+// The outputs change by
 //
 //   dx = dx_K,   dv = (dx - dx_n) / h,   dg = H dx_K + d/d(theta) (grad E_K) theta_dot   at pins,
 //
-// and forces of contact, on cloths and bodies, by minus the same of barrier and friction alone; bodies feel
-// attachments too.
+// and forces of contact, on cloths and bodies, by minus the corresponding terms of barrier and friction
+// alone; bodies feel attachments as well.
 
 #include <algorithm>
 #include <utility>
@@ -27,10 +28,10 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// How grad E changes at all points with the inputs that potentials have, at fixed points.
+/// Changes of grad E at all points along a direction of the potentials' inputs, at fixed points.
 struct GradientTangent {
-  Array touching;  ///< of barrier and friction
-  Array others;    ///< of the others
+  Array touching;  ///< change due to barrier and friction
+  Array others;    ///< change due to the other potentials
 };
 
 std::vector<GradientTangent> gradient_tangents(
@@ -57,14 +58,14 @@ std::vector<GradientTangent> gradient_tangents(
   return result;
 }
 
-/// d: the change of all points with the prescribed ones, at fixed rows.
+/// d: the change of all points due to the prescribed ones, at fixed rows.
 Array prescribed_tangent(const Pushforward& step, std::size_t l, const Array& x) {
   Array d = step.directions[l].ends;
   step.problem.coordinates.carry(x, d);
   return d;
 }
 
-/// Several vectors, and where their products go.
+/// Several vectors, and the destinations of their products.
 struct ProductList {
   std::vector<const double*> z;
   std::vector<double*> y;
@@ -172,7 +173,7 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
 
 std::vector<Array> ContactStage::tangent(const Pushforward& step) {
   ContactSum sum(potentials(), step.problem, step.detection, nullptr, nullptr);
-  std::vector<Array> dx;  // of the lag configuration
+  std::vector<Array> dx;  // change of the lag configuration
   for (const Tangents& tangents : step.directions) dx.push_back(tangents.start);
   TakenSolves solves(step, sum, first_factor);
   for (std::size_t k = 0; k < solves.count(); ++k) {

@@ -21,7 +21,7 @@ void solve_by_newton(Problem& problem,
                      const Forward& step,
                      const NodalStage& nodes,
                      std::vector<double>& x) {
-  // Its way is no motion of the cloth.
+  // The iterates of this stage are no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
   const solver::Outcome outcome =
       nodes.has_contacts()
@@ -32,8 +32,8 @@ void solve_by_newton(Problem& problem,
   step.kept.add(outcome.certificate);
 }
 
-/// By local/global iterations, from which no factor comes: backward makes it. What they give up Newton's
-/// method solves, from the same start.
+/// Solve by local/global iterations. They yield no factor, so backward computes one. If they give up,
+/// Newton's method solves from the same start.
 void solve_by_projective_dynamics(Problem& problem,
                                   const Forward& step,
                                   const NodalStage& nodes,
@@ -62,7 +62,7 @@ void solve_by_projective_dynamics(Problem& problem,
   if (is_late) checkpoint.stop_clock();
   if (outcome.status != projective::LocalGlobalStatus::kConverged) {
     ++step.report.counts.left_to_newton;
-    if (!is_late) x = start;  // else only the residual of the last iterate is left to compute
+    if (!is_late) x = start;  // else only the residual of the last iterate is computed
     solve_by_newton(problem, step, nodes, x);
     return;
   }
@@ -76,7 +76,7 @@ void solve_by_projective_dynamics(Problem& problem,
 }  // namespace
 
 std::vector<double> ElasticStage::forward(const Forward& step, const Forces& forces) const {
-  // Pins are at their targets, and so are the bodies.
+  // Pins and bodies are at their targets.
   std::vector<double> x = problem_.predicted(problem_.inertia.target().data());
   if (nodes_.has_contacts()) nodes_.start(x);
   if (problem_.scene.given.elastic == ElasticSolver::kProjective) {

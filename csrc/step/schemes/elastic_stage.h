@@ -7,15 +7,15 @@
 
 namespace diffcloth::step {
 
-/// The stage of a scheme that comes without the barrier: inertia and all potentials of the cloths, with dry
-/// frictional contact at nodes where there is any. It is on the tape as "elastic": its positions.
+/// The stage of a scheme without the barrier: inertia and all potentials of the cloths, with dry
+/// frictional contact at nodes if there is any. The tape stores its positions as "elastic".
 class ElasticStage {
  public:
   explicit ElasticStage(Problem& problem) : problem_(problem), nodes_(problem) {}
 
   bool has_contacts() const { return nodes_.has_contacts(); }
 
-  /// All points at its end; the forces there are added.
+  /// All points at the end of the stage; its forces are added.
   std::vector<double> forward(const Forward& step, const Forces& forces) const;
 
   /// @param g  of each loss, cotangent of the rows at its end

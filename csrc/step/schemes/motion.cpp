@@ -37,7 +37,7 @@ std::vector<double> GeodesicMotion::root_poses(double fraction) const {
   for (Index b = 0; fraction > 0.0 && b < count; ++b) {
     const Eigen::Map<const bodies::Pose> start(from + 7 * b);
     const Eigen::Map<const bodies::Pose> end(to + 7 * b);
-    if (start == end) continue;  // to the bit
+    if (start == end) continue;  // exact to the bit
     Eigen::Map<bodies::Pose>(poses.data() + 7 * b) = bodies::interpolate(start, end, fraction);
   }
   return poses;

@@ -1,10 +1,11 @@
-// The adjoint of a step of second order begins with the contact stage (contact_adjoint.cpp), whose shifted
-// potentials yield the cotangent of the shift d,  d_bar = W''(x' - d) zhat. With d = y - x_n and y the minimizer of
+// The adjoint of a step of second order begins with the contact stage (contact_adjoint.cpp), whose
+// shifted potentials yield the cotangent of the shift d,  d_bar = W''(x' - d) zhat.  With d = y - x_n
+// and y the minimizer of
 //
 //   1/(2 h^2) |y - x_n - h v_n|^2_M + 1/2 (y - x_n)^T S(u) (y - x_n),
 //
-// d_bar is the g of the adjoint of this minimization, which has the same form. Its inputs are x_n, v_n, u, the
-// ends of prescribed points, masses and stiffnesses. Tangents go the other way.
+// d_bar is the g of the adjoint of this minimization, which has the same form. Its inputs are x_n, v_n,
+// u, the ends of prescribed points, masses and stiffnesses. Tangents are propagated in reverse order.
 
 #include "step/schemes/second_order.h"
 
@@ -29,13 +30,14 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Whether a point is a vertex whose end is given: a pin, or of a body whose motion is prescribed.
+/// True if a point is a vertex with a prescribed end: a pin, or a vertex of a body with prescribed
+/// motion.
 bool follows_ends(const Problem& p, std::size_t point) {
   const auto vertices = static_cast<std::size_t>(p.scene.vertex_count());
   return point < vertices && p.scene.prescribed[point] != 0;
 }
 
-/// u: x_n + h v_n / 2 of free vertices of cloths, of prescribed points the mean of both ends.
+/// u: x_n + h v_n / 2 of free vertices of cloths; the mean of both ends of prescribed points.
 Array middle(const Problem& p) {
   Array u = p.coasting();
   for (std::size_t a = 0; a < u.size(); ++a) u[a] = 0.5 * (u[a] + p.start[a]);
@@ -52,7 +54,7 @@ void add_to_ends(const Problem& p, Array bar, Cotangents& bars) {
 
 /// Pull a cotangent of u back.
 ///
-/// @param bar  of the first points, or of all
+/// @param bar  of the cloths' points, or of all points
 void pull_back_middle(const Problem& p, const Array& bar, Cotangents& bars) {
   Array ends_bar(p.start.size(), 0.0);
   for (std::size_t a = 0; a < bar.size(); ++a) {
@@ -80,7 +82,8 @@ Array middle_tangent(const Problem& p, const Tangents& tangents, const Array& en
   return dot;
 }
 
-/// The first stage: the displacement that the cloths would have by their velocities, without the fast modes of strain.
+/// The first stage: the displacement of the cloths by their velocities, without the fast modes of
+/// strain.
 class Filter {
  public:
   explicit Filter(Problem& p)
@@ -98,7 +101,7 @@ class Filter {
 
   const solver::Objective& objective() const { return objective_; }
 
-  /// All points where it ends; none where rounding leaves no definite matrix.
+  /// All points at the end of the filter; none if rounding leaves no definite matrix.
   std::optional<Array> solve(const Forward& step) const {
     Array y = p_.coasting();
     objective_.stand_at(y.data());
@@ -107,7 +110,7 @@ class Filter {
     solver::LinearSystem system(objective_, *step.context.workspace, *step.context.watch,
                                 *step.context.counts);
     linalg::BlockMatrix matrix = system.assemble(y.data(), Curvature::kExact, g);
-    // It is definite by construction: no certificate is needed.
+    // Positive definite by construction: no certificate is needed.
     solver::Certificate certificate{.factor = system.factor(matrix), .hessian = nullptr};
     if (!certificate.factor) return std::nullopt;
     if (certificate.factor->precision() == linalg::Precision::kSingle) {
@@ -143,7 +146,7 @@ class Filter {
     pull_back_middle(p_, middle_bar, bars);
   }
 
-  /// Put the tangents of its own inputs into its potentials.
+  /// Put the tangents of the filter's own inputs into its potentials.
   ///
   /// @param ends_dot  of all points
   void set_tangents(const Tangents& tangents, const Array& ends_dot) {
@@ -177,15 +180,16 @@ class Filter {
   solver::Objective objective_;
 };
 
-/// The second stage: the contact stage with elasticity and springs evaluated at points less the displacement.
+/// The second stage: the contact stage, with elasticity and springs evaluated at points minus the
+/// displacement.
 ///
-/// The strain of a face at x' is that at y = x' - d and  sym(F(x' - d/2)^T F(d)),  of which the filter has left
-/// sym(F(u)^T F(d)). Contact may lead x' - d/2 far from u in one step, so that the positions x' are strained: the stage
-/// resists the difference e = sym(F(x' - d/2 - u)^T F(d)), by elastic::ChordStrain. In smooth motion e is of third
-/// order in h.
+/// The strain of a face at x' is its strain at y = x' - d plus  sym(F(x' - d/2)^T F(d));  the filter has
+/// left sym(F(u)^T F(d)) of it. Contact may lead x' - d/2 far from u in one step, so that the positions
+/// x' are strained: the stage resists the difference e = sym(F(x' - d/2 - u)^T F(d)), by
+/// elastic::ChordStrain. In smooth motion e is of third order in h.
 class ShiftedStage {
  public:
-  /// @param y  all points where the filter has ended
+  /// @param y  all points at the end of the filter
   ShiftedStage(Problem& p, const Array& y)
       : p_(p),
         shift_(p.start.size(), 0.0),
@@ -199,7 +203,7 @@ class ShiftedStage {
     for (std::size_t a = 0; a < shift_.size(); ++a) {
       if (a < p.cloth_size || follows_ends(p, a / 3)) shift_[a] = y[a] - p.start[a];
     }
-    // Inertia leads to x_n + h v_n; strain takes the difference to y from it.
+    // Inertia leads to x_n + h v_n; strain absorbs the difference to y.
     const Array coasting = p.coasting();
     for (std::size_t a = 0; a < p.cloth_size; ++a) {
       start_[a] = p.start[a] - shift_[a];
@@ -228,7 +232,8 @@ class ShiftedStage {
     chords_.swap_cotangents(store);
   }
 
-  /// Pull the cotangent of the shift back to the start and to prescribed ends. Returns the cotangent of y, by row.
+  /// Pull the cotangent of the shift back to the start and to prescribed ends. Returns the cotangent of
+  /// y, by row.
   Array pull_back(Cotangents& bars) const {
     Array bar(shift_.size(), 0.0);
     for (const Shifted* potential : {&elastic_, &attachments_, &soft_pins_}) {
@@ -257,7 +262,7 @@ class ShiftedStage {
     return rows;
   }
 
-  /// Put a tangent of the shift into the potentials, whose other tangents are there.
+  /// Put a tangent of the shift into the potentials, which hold the other tangents already.
   ///
   /// @param y_dot     of all points
   /// @param ends_dot  likewise
@@ -289,7 +294,7 @@ class ShiftedStage {
   elastic::ChordStrain chords_;
 };
 
-/// All points where the filter of a step has ended, from the tape.
+/// All points at the end of a step's filter, from the tape.
 Array filtered(const Taken& step) {
   Array y = step.problem.coasting();
   std::copy_n(step.tape["filter"], step.problem.cloth_size, y.begin());

@@ -4,20 +4,23 @@
 
 namespace diffcloth::step {
 
-/// The coupled scheme with a step of second order where motion is smooth, and of implicit Euler's behavior in
-/// contact. From x_n and v_n:
+/// The coupled scheme with steps of second order where motion is smooth, and with the behavior of
+/// implicit Euler in contact. From x_n and v_n:
 ///
 ///   1. Filter:  (M + h^2 S(u)) d = M h v_n,   u = x_n + h v_n / 2,  S the stiffness against strain rates;
 ///      prescribed points have d = their motion.
-///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + E(x) + barrier + friction + drag,   v' = (x' - x_n) / h,
+///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + E(x) + barrier + friction + drag,
+///      v' = (x' - x_n) / h,
 ///
-/// W the energy of elasticity, damping and springs; drag that of the mean of v_n and v'; and E the energy of
-/// elastic/chord_strain.h, which keeps strain small that d would cause where contact turns faces.
+/// W is the energy of elasticity, damping and springs; drag is evaluated at the mean of v_n and v'; E is
+/// the energy of elastic/chord_strain.h, which keeps the strain small that d would cause where contact
+/// turns faces.
 ///
-/// With d = h v_n it is leapfrog on the Moreau envelope of W, with velocities at the middle of steps: unconditionally
-/// stable, of second order. The filter takes modes that are fast beside the step to implicit Euler. Contact, friction
-/// and gravity are those of implicit Euler, so that rest is exact, and nothing is averaged that the barrier has
-/// changed. The balance of linear momentum holds for every S.
+/// With d = h v_n this is leapfrog on the Moreau envelope of W, with velocities at the middle of steps:
+/// unconditionally stable, of second order. For modes that are fast compared with the step, the filter
+/// yields implicit Euler. Contact, friction and gravity are treated as in implicit Euler, so that rest
+/// is exact, and nothing is averaged that the barrier has changed. The balance of linear momentum holds
+/// for every S.
 class SecondOrder final : public Scheme {
  public:
   std::vector<Field> tape(const Scene& scene) const override;

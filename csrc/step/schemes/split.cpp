@@ -1,7 +1,7 @@
-// The adjoint of `split` begins with its contact stage (contact_stage.cpp), whose target is x^D. The cotangent
-// of x^D is the g of the adjoint of the elastic stage, which has the same form: the paper's Eqs. 8 and 29 with
-// all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents go the other way: the
-// tangent of x^D is an input of the contact stage.
+// The adjoint of `split` begins with its contact stage (contact_adjoint.cpp), whose target is x^D. The
+// cotangent of x^D is the g of the adjoint of the elastic stage, which has the same form: the paper's
+// Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents
+// are propagated in reverse order: the tangent of x^D is an input of the contact stage.
 
 #include "step/schemes/split.h"
 
@@ -25,17 +25,18 @@ using Array = std::vector<double>;
 /// Nearness to x^D: the objective of the contact stage without barrier and friction.
 ///
 /// `energy` is  P(x) - P(x^D) - grad P(x^D) (x - x^D),  P inertia and elasticity, soft pins and damping
-/// included: its excess over the elastic stage's minimum, in joules. The others are
-/// 1/2 |x - x^D|^2 in a matrix G / h^2: the masses, the identity, or, in `elastic`, h^2 A with
-/// A = M/h^2 + L the constant matrix of the whole elastic stage. L annihilates constants, so that a free
-/// cloth keeps its momentum as it does in the masses alone; but it resists turns by k_s |R - R^D|^2 / 2.
-/// Let an element turn by b over the step, and by a from x^D: these forces then do work -k_s a b on it. It is
-/// a gain wherever x^D is ahead, and more than all else where a stiff sheet turns far in a step. No constant
-/// matrix does without: one that lets turns be, to first order, strains by a^2 / 2.
+/// included: its excess over the elastic stage's minimum, in joules. The other metrics are  1/2 |x -
+/// x^D|^2  in a matrix G / h^2: the masses, the identity, or, in `elastic`, h^2 A with A = M/h^2 + L the
+/// constant matrix of the whole elastic stage. L annihilates constants, so that a free cloth keeps its
+/// momentum as with the masses alone; but it resists rotations by  k_s |R - R^D|^2 / 2.  Let an element
+/// turn by b over the step, and by a from x^D: these forces then do work -k_s a b on it. This work is a
+/// gain wherever x^D is ahead, and exceeds all other terms if a stiff sheet turns far in a step. Every
+/// constant matrix has this defect: one that does not resist rotations to first order strains by  a^2 /
+/// 2.
 class Nearness {
  public:
-  /// @param tilted  whether x^D leaves forces that P does not have, those at nodes in contact; else
-  ///                grad P(x^D) is zero up to the elastic stage's tolerance
+  /// @param tilted  true if x^D leaves forces that P does not have: those at nodes in contact; else grad
+  ///                P(x^D) is zero up to the elastic stage's tolerance
   Nearness(Problem& problem, Array x_d, bool tilted) : problem_(problem), x_d_(std::move(x_d)) {
     switch (problem.scene.given.metric) {
       case Metric::kEnergy:
@@ -56,7 +57,7 @@ class Nearness {
     __builtin_unreachable();
   }
 
-  /// Report whether it changes with x^D.
+  /// True if the nearness changes with x^D.
   static bool follows_target(const Problem& problem, bool tilted) {
     return tilted || problem.scene.given.metric != Metric::kEnergy;
   }
@@ -78,7 +79,7 @@ class Nearness {
             .set_tangents = {}};
   }
 
-  /// Swap the cotangents of its own potentials.
+  /// Swap the cotangents of the nearness's own potentials.
   void swap_cotangents(CotangentStore& store) {
     store.begin();
     if (inertial_) inertial_->swap_cotangents(store);
@@ -86,9 +87,9 @@ class Nearness {
     if (tilt_) tilt_->swap_cotangents(store);
   }
 
-  /// Put the tangents of its own potentials into them; P has its tangents already.
+  /// Put the tangents of the nearness's own potentials into them; P has its tangents already.
   ///
-  /// @param x_d_dot  of x^D, of all points
+  /// @param x_d_dot  tangent of x^D, at all points
   void set_tangents(const Tangents& tangents, const Array& x_d_dot) {
     const Array target(x_d_dot.begin(), x_d_dot.begin() + static_cast<std::ptrdiff_t>(x_d_.size()));
     if (inertial_) {
@@ -101,7 +102,7 @@ class Nearness {
     if (tilt_) tilt_->force_dot = gradient_tangent(target);
   }
 
-  /// Cotangent of x^D; the cotangents of masses and of P are added where they belong.
+  /// Cotangent of x^D; adds the cotangents of masses and of P to their owners.
   Array pull_back(Cotangents& bars) {
     Array bar(problem_.cloth_size, 0.0);
     if (inertial_) {
@@ -153,7 +154,7 @@ class Nearness {
     });
   }
 
-  /// Into the cotangents of the masses that G is made of.
+  /// Add to the cotangents of the masses in G.
   void add_masses_bar(const Array& bar, Array& masses_bar) const {
     const bool is_uniform = problem_.scene.given.metric == Metric::kIdentity;
     const double shared = is_uniform ? mean(bar) : 0.0;
@@ -163,7 +164,7 @@ class Nearness {
   Problem& problem_;
   Array x_d_;
   // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
-  std::optional<Proximity> inertial_;  ///< in G less h^2 L, which is diagonal [kg]
+  std::optional<Proximity> inertial_;  ///< nearness in the diagonal matrix G - h^2 L [kg]
   std::optional<elastic::ElasticNearness> elastic_;
   std::optional<Tilt> tilt_;
 };
@@ -180,7 +181,7 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 void Split::forward(const Forward& step, Array& x, const Forces& forces) const {
   Problem& problem = step.problem;
   const ElasticStage elastic(problem);
-  // Nearness in energy holds the pins against all potentials of the elastic stage, too.
+  // Nearness in energy also holds the pins against all potentials of the elastic stage.
   Array unused(3 * problem.scene.given.pins.size());
   Forces elastic_forces = forces;
   if (!Nearness::follows_target(problem, elastic.has_contacts()))

@@ -4,8 +4,8 @@
 
 namespace diffcloth::step {
 
-/// The paper's scheme (Eqs. 21-29): first inertia + elasticity + anchors without contact, which gives
-/// x^D; then 1/(2h^2) (x - x^D)^T G (x - x^D) + barrier + friction.
+/// The paper's scheme (Eqs. 21-29): first inertia + elasticity + anchors without contact, with the
+/// solution x^D; then 1/(2h^2) (x - x^D)^T G (x - x^D) + barrier + friction.
 class Split final : public Scheme {
  public:
   std::vector<Field> tape(const Scene& scene) const override;

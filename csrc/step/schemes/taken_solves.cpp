@@ -13,7 +13,7 @@ using contact::Contact;
 
 TakenSolves::TakenSolves(const Taken& step, ContactSum& sum, std::size_t first_factor)
     : step_(step), sum_(sum), first_factor_(first_factor) {
-  // The tape has been in other hands: hooks on saved tensors may return anything.
+  // The tape may have been changed: hooks on saved tensors may return anything.
   const double count = *step.tape["solves"];
   if (!(count >= 1.0 && count <= step.problem.scene.given.friction_iterations)) {
     throw std::invalid_argument(

@@ -9,33 +9,34 @@
 
 namespace diffcloth::step {
 
-/// The solves of a contact stage that have been taken, to be differentiated one by one in any order.
+/// The solves of a completed contact stage, to be differentiated one by one in any order.
 ///
-/// Contacts and certificates that forward has not kept are recomputed from the tape.
+/// Contacts and certificates that forward did not keep are recomputed from the tape.
 class TakenSolves {
  public:
-  /// @param sum           stands where the last stand() says
+  /// @param sum           its current point is set by stand()
   /// @param first_factor  place of the stage's factors among the scheme's
   TakenSolves(const Taken& step, ContactSum& sum, std::size_t first_factor);
 
   std::size_t count() const { return count_; }
 
-  /// Let the sum stand at the solution of solve k, with friction taken from the configuration before.
+  /// Set the sum to the solution of solve k, with friction lagged at the previous configuration.
   void stand(std::size_t k);
 
   const std::vector<double>& x() const { return x_; }
   const std::vector<double>& x_lag() const { return x_lag_; }
 
-  /// Certificate of the solve; empty if evicted. A solve that had none gets it, and its solution is refined.
+  /// Certificate of the solve; empty if evicted. A solve without certificate is refined and certified
+  /// here.
   const solver::Certificate& certificate() const { return certificate_; }
 
  private:
-  /// Minimize from where an uncertified solve has ended, which its derivative takes for a solution.
+  /// Minimize from the end of an uncertified solve, as derivatives assume a solution.
   ///
-  /// @throws std::domain_error if that does not converge
+  /// @throws std::domain_error if the solve does not converge
   void refine();
 
-  /// All points at the start, k = 0, or where solve k has ended; and the contacts there.
+  /// All points at the start (k = 0) or at the end of solve k; contacts_at(): the contacts there.
   std::vector<double> at(std::size_t k) const;
   const std::vector<contact::Contact>& contacts_at(std::size_t k, const std::vector<double>& x);
 
@@ -50,8 +51,8 @@ class TakenSolves {
 
 /// The certificate of a solve, recomputed if evicted.
 ///
-/// @param gradient  out: that at x, where the certificate is gone or the coordinates are curved
-/// @throws std::domain_error where x is no local minimum
+/// @param gradient  out: gradient at x, if the certificate is evicted or the coordinates are curved
+/// @throws std::domain_error if x is no local minimum
 solver::Certificate certified(solver::LinearSystem& system,
                               const solver::Objective& objective,
                               const std::vector<double>& x,

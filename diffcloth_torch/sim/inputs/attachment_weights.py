@@ -1,4 +1,4 @@
-"""Weights of attachments where a control says nothing, and what it may not leave out."""
+"""Default weights of attachments, and the check that weighted attachments have targets."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from diffcloth_torch.sim.inputs.layout import Layout
 __all__ = ["Targets", "default_weights", "refuse_untargeted"]
 
 Targets = Tensor | Mapping[str, Tensor]
-"""A field of a control that is set: all rows, or some by name."""
+"""A field that a control sets: all rows, or some by name."""
 
 
 def default_weights(layout: Layout, targets: Targets | None) -> Tensor:
-    """One of every spring that has both ends, zero of those whose target is not set; [1, A]."""
+    """One for every spring with both ends, zero for springs without a target; [1, A]."""
     unset = layout.zeros["attachment_weights"]
     if targets is None:
         return unset
@@ -29,10 +29,10 @@ def default_weights(layout: Layout, targets: Targets | None) -> Tensor:
 
 
 def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) -> None:
-    """Refuse weights [B, A] that pull to targets that are not set.
+    """Refuse nonzero weights [B, A] of attachments without a target.
 
     Raises:
-        InvalidInput: If one is not zero.
+        InvalidInput: If a weight of such an attachment is not zero.
     """
     whole = _are_whole(layout, targets)
     for name in layout.assembly.springs.target_groups:
@@ -45,7 +45,7 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
 
 
 def _are_whole(layout: Layout, targets: Targets | None) -> NDArray[np.bool_]:
-    """Which springs have both ends; numbers, which no transform of torch wraps."""
+    """Mask of springs with both ends; as numbers, which no transform of torch wraps."""
     springs = layout.assembly.springs
     whole = np.asarray(springs.targets < 0)
     names = springs.target_groups if isinstance(targets, Tensor) else targets or ()

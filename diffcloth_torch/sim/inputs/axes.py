@@ -1,8 +1,8 @@
-"""The leading axis of environments: added to what a caller passes, removed from what it gets.
+"""The leading axis of environments: added to inputs of a caller, removed from results.
 
-Inside `sim/` every value of a state, a control, parameters or an outcome has it. It has as many
-rows as the state has environments (one for a state without a batch axis), or one row for a value
-that all environments share.
+Inside `sim/` every value of a state, a control, parameters or an outcome has this axis. It has as
+many rows as the state has environments (one for a state without a batch axis), or one row for a
+value that all environments share.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ __all__ = ["with_axis", "without_axes", "without_axis"]
 
 
 def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> Tensor:
-    """Give a tensor of checked shape its leading axis.
+    """Add the leading axis to a tensor of checked shape, if it is missing.
 
     Args:
-        name: Opens a message.
+        name: Prefix of the message.
         tensor: Tensor of `dimensions` axes, or one more for the environments.
         dimensions: Number of axes of the value of one environment.
         batch: Number of environments of the state, None if it has no batch axis.
@@ -41,7 +41,7 @@ def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> 
 def without_axis(tensor: Tensor, batch: int | None) -> Tensor:
     """Copy rows [B or 1, ...] for a caller; without the leading axis if `batch` is None.
 
-    The copy shares no storage with what the caller passed or with what is kept here.
+    The copy shares no storage with inputs of the caller or with internal tensors.
     """
     if batch is None:
         rows = tensor.select(0, 0)

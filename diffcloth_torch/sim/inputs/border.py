@@ -1,7 +1,7 @@
-"""The border of `sim/`: checks what a caller passes, and gives it a leading axis of environments.
+"""The border of `sim/`: checks inputs of a caller, and adds a leading axis of environments.
 
-`axes.without_axis` removes that axis from what a caller gets back. Between the two everything has
-it, whether or not the caller has a batch.
+`axes.without_axis` removes that axis from results. Between the two every value has the axis, with
+or without a batch.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Given(NamedTuple):
     parameters: Fields
 
     def at_rest(self) -> Given:
-        """The same with zero velocities."""
+        """Return the same inputs with zero velocities."""
         names = (name for name in self.state if name.endswith("velocities"))
         still = {name: torch.zeros_like(self.state[name]) for name in names}
         return self._replace(state=self.state | still)
@@ -54,14 +54,14 @@ class Border:
     def __init__(
         self, layout: Layout, defaults: Fields, nonadjacent_distance: float, *, self_contact: bool
     ) -> None:
-        """Keep what inputs are checked against.
+        """Keep the data for checks of inputs.
 
         Args:
             layout: Shapes, and rows by name.
             defaults: Parameters of the scene, as fields.
             nonadjacent_distance: Smallest distance between parts of a cloth that share no vertex
                 [m].
-            self_contact: Whether cloths collide with themselves.
+            self_contact: True if cloths collide with themselves.
         """
         self.defaults = without_elasticity(layout, defaults)
         self._layout = layout
@@ -80,7 +80,7 @@ class Border:
         return state_fields(self._layout, state)
 
     def parameters(self, parameters: Parameters | None, batch: int | None) -> Fields:
-        """Check parameters and complete them from those of the scene, which are already checked."""
+        """Check parameters and complete them by the scene's, which are already checked."""
         if parameters is None:
             return self.defaults
         physical = parameter_fields(self._layout, parameters, self.defaults, batch)
@@ -91,7 +91,7 @@ class Border:
         """Refuse a barrier that reaches from one part of a cloth to the next.
 
         Args:
-            owner: Opens the message.
+            owner: Prefix of the message.
             inputs: Fields of parameters.
         """
         assembly = self._layout.assembly

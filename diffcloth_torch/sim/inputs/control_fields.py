@@ -1,7 +1,7 @@
 """From a control to fields that are checked, complete and have their leading axis.
 
-Everything is ordinary differentiable torch, so that gradients flow back to what the caller passed,
-in its own dtype.
+All operations are ordinary differentiable torch, so that gradients flow back to the caller's
+inputs, in their own dtype.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from diffcloth_torch.sim.records.controls import Control
 __all__ = ["check_control", "control_fields"]
 
 _POSES = ("body_poses", "base_poses")
-# Field of a control -> field of the state that it holds if it is not set.
+# Field of a control -> field of the state to which it defaults.
 _HELD = {"soft_pins": "soft_pin_targets", "body_poses": "body_poses", "base_poses": "base_poses"}
 
 
@@ -116,7 +116,7 @@ def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> d
 
 
 def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) -> None:
-    """Refuse what nothing feels, as wrenches on prescribed bodies; joints beyond a limit."""
+    """Refuse values without effect, as wrenches on prescribed bodies; joints beyond a limit."""
     if field == "wind" and not layout.cloth_names:
         raise InvalidInput(
             f"{label('control', field)} must be None: the scene has no cloth that feels it"
@@ -132,7 +132,7 @@ def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) 
     if field == "joint_positions":
         rows = slice(first, first + values.shape[-1])
         lower, upper = layout.permissions.lower[rows], layout.permissions.upper[rows]
-        # A value that is the limit rounded to float32 stands for the limit.
+        # A limit rounded to float32 is accepted as the limit.
         beyond = (values < np.minimum(lower, lower.astype(np.float32))) | (
             values > np.maximum(upper, upper.astype(np.float32))
         )
@@ -150,7 +150,7 @@ def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) 
 def control_fields(
     layout: Layout, control: Control | None, state: Fields, batch: int | None
 ) -> Fields:
-    """Complete a control: unset poses and targets hold those of the state, the rest is zero."""
+    """Complete a control: poses and targets default to the state's, all other fields to zero."""
     given = {} if control is None else _targets(layout, control)
     targets = given.get("attachments")
     fields = {}
@@ -166,7 +166,7 @@ def control_fields(
 
 
 def _unset(layout: Layout, field: str, state: Fields, targets: Targets | None) -> Tensor:
-    """What a field of a control is where it says nothing."""
+    """Return the default of a field of a control."""
     if field == "attachment_weights":
         return default_weights(layout, targets)
     if field in _HELD:
@@ -232,7 +232,7 @@ def _complete_by_name(
 
 
 def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:
-    """Refuse to move what is not kinematic; a row rounded to float32 stands for the state's."""
+    """Refuse to move objects that are not kinematic; poses rounded to float32 are accepted."""
     reasons = layout.permissions.kept[field]
     still = [k for k, why in enumerate(reasons) if why]
     if not still:

@@ -27,24 +27,23 @@ class Layout:
 
     Attributes:
         assembly: Arrays of the scene.
-        permissions: Which rows a control may set, and within which limits.
+        permissions: Rows that a control may set, and their limits.
         state_shapes: Shape of each field of a state that a step reads.
-        state_fields: Names of the fields of a state that anything is computed with, except the
-            time.
+        state_fields: Names of the fields of a state that enter any computation, except the time.
         control_shapes: Shape of each field of a control.
         control_fields: Names of these fields.
         zeros: Field of a control -> its constant default, one environment for all. Never edited.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Indices of the pinned vertices, shape [P].
-        elastic: Number of cloths or of faces -> which of them are not deforming bodies or theirs,
-            [1, C] or [1, F].
+        elastic: Number of cloths or of faces -> mask of cloths that are not deforming bodies, or of
+            their faces, [1, C] or [1, F].
         body_vertex_rows: Vertices of deforming bodies, shape [D].
         corners: Vertices of the faces of cloths, shape [F, 3].
         robots: Links of each of the R robots.
-        shaped_links: Which of the L links have a shape, in the order of the surfaces.
+        shaped_links: Indices of the links with a shape, in the order of the surfaces.
         rigid_vertices: Name of a body or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
-        is_dynamic: Whether a body or a robot is dynamic.
+        is_dynamic: True if a body or a robot is dynamic.
         groups: Field of a control -> name -> its rows.
         cloth_names: Name of each of the C cloths.
         rows_by_name: Letter of an axis -> name -> rows: of surfaces "S", bodies "K", links "L" and
@@ -93,7 +92,7 @@ class Layout:
             if CONTROL[name].source in ("zero", "released")
             or (name in ("pins", "body_vertices") and 0 in shape)
         }
-        # What is between points of the scene holds unless a control releases it.
+        # Attachments between points of the scene act unless a control releases them.
         between = self.assembly.springs.targets < 0
         self.zeros["attachment_weights"] = torch.from_numpy(between.astype(np.float64))[None]
 
@@ -159,7 +158,7 @@ class Layout:
 
     @property
     def has_coordinates(self) -> bool:
-        """Whether the scene has robots or dynamic bodies."""
+        """Return whether the scene has robots or dynamic bodies."""
         return self.is_dynamic or bool(self.robots)
 
     def entry_shape(self, field: str, name: str) -> Shape:
@@ -169,7 +168,7 @@ class Layout:
         return (rows.stop - rows.start, *shape) if field in SEVERAL else shape
 
     def full_name(self, field: str, key: str) -> str:
-        """Find the full name, "owner/name", for a key of a control's mapping.
+        """Return the full name, "owner/name", for a key of a control's mapping.
 
         Raises:
             InvalidInput: If no or more than one full name matches, or the field cannot set that

@@ -23,17 +23,17 @@ __all__ = ["has_names", "named_rows"]
 
 
 def has_names(name: str) -> bool:
-    """Whether a parameter has rows that can be named."""
+    """Return whether a parameter has rows with names."""
     return any(isinstance(letter, str) for letter in PARAMETERS[name].axes[-1])
 
 
 def named_rows(
     layout: Layout, name: str, given: Mapping[object, Tensor], default: Tensor, batch: int | None
 ) -> Tensor:
-    """Complete a parameter of which some rows are given by names, to rows [1 or B, rows, ..].
+    """Complete a parameter with some rows given by names, to rows [1 or B, rows, ..].
 
     Args:
-        layout: What the rows stand for.
+        layout: Meaning of the rows.
         name: Name of the parameter.
         given: Name, or pair of names, -> values.
         default: Values of the scene, [1, rows, ..].
@@ -57,7 +57,7 @@ def named_rows(
         opening = label("parameters", f"{name}[{key!r}]")
         row = PARAMETERS[name].row_shape
         size = place.stop - place.start
-        # One row has no axis of its own, but the vertices of a cloth do.
+        # A single row has no axis of its own, but the vertices of a cloth do.
         several = size > 1 or axes[0] == "N"
         values = _checked(name, opening, value, (size, *row) if several else row, row, batch)
         rows = _replaced(rows, cpu.arange(place.start, place.stop), values)
@@ -80,7 +80,7 @@ def _checked(
 
 
 def _full_name(name: str, groups: Mapping[str, slice], key: object, taken: set[str]) -> str:
-    """Find the full name of a key, which may be only the part after '/' if that is unique."""
+    """Return the full name of a key, which may be the part after '/' if that is unique."""
     full = [key] if key in groups else [g for g in groups if g.partition("/")[2] == key]
     if len(full) != 1:
         problem = "is the name of several" if full else "is none of them"

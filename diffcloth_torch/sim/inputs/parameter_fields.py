@@ -57,7 +57,7 @@ def parameter_fields(
     defaults: Fields,
     batch: int | None,
 ) -> Fields:
-    """Check parameters; a field that is None takes its value from `defaults`, which has all."""
+    """Check parameters; a field that is None has its value in `defaults`, which has all."""
     checked = check_parameters(parameters)
     fields = dict(defaults)
     for name, quantity in PARAMETERS.items():
@@ -85,7 +85,7 @@ def parameter_fields(
 
 
 def without_elasticity(layout: Layout, fields: Fields) -> Fields:
-    """Set what deforming bodies resist with, their mass and their drag, to zero."""
+    """Set elastic stiffness, mass and drag of deforming bodies to zero."""
     if not layout.assembly.deforming_count:
         return fields
     cloths = layout.assembly.cloth_count
@@ -100,7 +100,7 @@ def without_elasticity(layout: Layout, fields: Fields) -> Fields:
 
 
 def _at_faces(layout: Layout, opening: str, values: Tensor) -> Tensor:
-    """Means of the corners of each face, [nb, F], of values at vertices; others as they are."""
+    """Return values at vertices as means of the corners of each face, [nb, F]; others unchanged."""
     vertices, faces = len(layout.assembly.vertices), len(layout.assembly.faces)
     if values.shape[1] != vertices:
         return values
@@ -123,7 +123,7 @@ def _per_face(layout: Layout, values: FloatArray) -> FloatArray:
 
 
 def default_fields(defaults: Mapping[str, Tensor]) -> Fields:
-    """Give the parameters of one environment the axes of fields."""
+    """Add the axes of fields to the parameters of one environment."""
     return {name: _rows(tensor, 1, PARAMETERS[name].row_shape) for name, tensor in defaults.items()}
 
 
@@ -148,7 +148,7 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
         # A link that fixed joints join to others may be a point or a rod in its file.
         was_definite = np.linalg.eigvalsh(_symmetric(default))[..., 0] > 0.0
         _refuse_rows(layout, name, (least <= 0.0) & was_definite, "positive definite", massive)
-        # What has no mass in its file may be given some.
+        # Links without mass in their file may be assigned some.
         wrong = least < -_ROUNDING * np.abs(largest)
         _refuse_rows(layout, name, wrong, "positive semi-definite", moved)
 
@@ -164,7 +164,7 @@ def _refuse_rows(
     accepted: str,
     of: Mapping[str, NDArray[np.bool_]],
 ) -> None:
-    """Refuse wrong values of some bodies or links; those of others do not matter."""
+    """Refuse wrong values of some bodies or links; all others are ignored."""
     owner = name.partition("_")[0]
     wrong = wrong & of[owner]
     if not wrong.any():

@@ -1,4 +1,4 @@
-"""Which rows of a scene's tensors a control may set, and within which limits."""
+"""Rows of a scene's tensors that a control may set, and their limits."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ _MOTIONS = {"fixed": "static", "kinematic": "kinematic", "floating": "dynamic"}
 
 
 class Permissions:
-    """Which rows must keep the state's values and why, and limits of the others. Immutable.
+    """Rows that must keep the state's values, with reasons, and limits of the others. Immutable.
 
     Attributes:
-        kept: "body_poses" or "base_poses" -> why each row must equal the state's, or "".
-        unforced: "body_wrenches" or "base_wrenches" -> why each row must be zero, or "".
+        kept: "body_poses" or "base_poses" -> for each row the reason to equal the state's, or "".
+        unforced: "body_wrenches" or "base_wrenches" -> for each row the reason to be zero, or "".
         actuation: Actuation of each joint, length J.
-        driven: Which joints have a pd drive, shape [J].
-        at_rates: Which joints have prescribed velocities, shape [J].
-        at_positions: Which joints have prescribed positions, shape [J].
-        floating: Which robots have a floating base, shape [R].
-        settable: Field of a control -> which joints it can set, shape [J].
-        moved: "body" or "link" -> which of them forces move, [K] or [L].
-        massive: "body" or "link" -> which of them are of something dynamic and have mass, likewise.
+        driven: Mask of joints with a pd drive, shape [J].
+        at_rates: Mask of joints with prescribed velocities, shape [J].
+        at_positions: Mask of joints with prescribed positions, shape [J].
+        floating: Mask of robots with a floating base, shape [R].
+        settable: Field of a control -> mask of joints that it can set, shape [J].
+        moved: "body" or "link" -> mask of those that forces move, [K] or [L].
+        massive: "body" or "link" -> mask of dynamic ones with mass, likewise.
         lower: Lower limits [rad or m], shape [J].
         upper: Upper limits, likewise.
         farthest: Ends of the zones beyond the limits of joints under torque or pd, infinite for
-            others; the lower, then the upper ones, shape [2, J].
+            others; first the lower, then the upper ends, shape [2, J].
     """
 
     def __init__(self, assembly: Assembly) -> None:
@@ -90,7 +90,7 @@ class Permissions:
             )
 
     def refuse_unused(self, field: str, values: Tensor) -> None:
-        """Refuse to differentiate by a field of which no joint of the scene takes a row."""
+        """Refuse to differentiate by a field that no joint of the scene uses."""
         if field in _MODES and len(self.actuation) and not self.settable[field].any():
             modes = " or ".join(map(repr, _MODES[field]))
             remedy = f"have a joint of the actuation {modes}, or pass a detached tensor"

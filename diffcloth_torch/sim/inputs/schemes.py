@@ -1,4 +1,4 @@
-"""What each scheme supports, and errors for combinations that it does not."""
+"""Capabilities of each scheme, and errors for unsupported combinations."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def check_scheme(
     _check_attachments(scheme, coupling, layout)
     if integrator != INTEGRATORS[0]:
         _check_second_order(scheme, coupling, integrator, layout)
-    # The other schemes measure inertia in the masses; "mass", once the default, says just that.
+    # Other schemes measure inertia in the masses, as "mass", formerly the default, states.
     if not abilities["metrics"] and solver.metric not in (None, "mass"):
         raise InvalidInput(
             f"Simulator: `solver.metric` {solver.metric!r} needs scheme {_able('metrics')}, "
@@ -71,7 +71,7 @@ def check_scheme(
 
 
 def _check_attachments(scheme: str, coupling: str, layout: Layout) -> None:
-    """Bodies and links feel attachments where one solve moves everything."""
+    """Refuse attachments to bodies and links unless one solve moves everything."""
     assembly = layout.assembly
     if not assembly.cloth_count:
         return
@@ -91,7 +91,7 @@ def _check_attachments(scheme: str, coupling: str, layout: Layout) -> None:
 
 
 def _check_second_order(scheme: str, coupling: str, integrator: str, layout: Layout) -> None:
-    """The second-order step is one solve for everything, with springs to given motions alone."""
+    """Require a single solve for everything, and springs to prescribed motion alone."""
     start = f"Simulator: `integrator` {integrator!r} needs"
     if scheme != SCHEMES[0]:
         raise InvalidInput(f"{start} scheme {SCHEMES[0]!r}, got {scheme!r}")

@@ -69,8 +69,8 @@ class Observables:
 
         Args:
             state: The state.
-            parameters: Physical parameters, of which only the centers of mass are used; None takes
-                those of the scene.
+            parameters: Physical parameters, of which only the centers of mass are used; None: the
+                scene's.
 
         Returns:
             "robot/link" -> velocity of the link's center of mass (of the origin of its frame if the
@@ -86,12 +86,12 @@ class Observables:
     def contact_wrenches(
         self, state: State, parameters: Parameters | None = None
     ) -> dict[str, Tensor]:
-        """What forces of contact and attachments add up to, differentiable in both arguments.
+        """Return net wrenches of contact and attachments, differentiable in both arguments.
 
         Args:
             state: The state, whose `body_forces` act on its bodies and links.
-            parameters: Physical parameters, of which only the centers of mass are used; None takes
-                those of the scene.
+            parameters: Physical parameters, of which only the centers of mass are used; None: the
+                scene's.
 
         Returns:
             Name of a body, or "robot/link" -> force, then torque about the center of mass (about
@@ -110,17 +110,17 @@ class Observables:
 
     @guarded
     def contacts(self, state: State) -> ContactPoints:
-        """Return where surfaces touch at the end of the step that led to a state, and how hard.
+        """Return the contact points and forces of the step that led to a state.
 
-        What is returned has no gradient: a derivative of it by the state raises InvalidInput.
-        `state.contact_forces`, `state.body_forces` and `contact_wrenches(state)` have one.
+        The result has no gradient: a derivative by the state raises InvalidInput.
+        `state.contact_forces`, `state.body_forces` and `contact_wrenches(state)` have gradients.
 
         Args:
-            state: The result of a step of this simulator. Fields that have been replaced since do
-                not change its contacts.
+            state: The result of a step of this simulator. Fields that were replaced since do not
+                change its contacts.
 
         Returns:
-            All contacts, with a leading axis and padded to one number in a batch.
+            All contacts; in a batch with a leading axis, and padded to equal numbers.
 
         Raises:
             InvalidInput: If the state has no contacts of a step, or the scene has contact at
@@ -157,11 +157,12 @@ class Observables:
         Args:
             state: The state at the start of the step, without a batch axis.
             control: Targets for the end of the step, and forces; None holds pins and bodies.
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
 
         Returns:
-            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices; of
-            smooth bodies and links the ends of their skeletons, and what says how they turn.
+            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices; for
+            smooth bodies and links the ends of their skeletons and points that follow their
+            rotation.
         """
         with torch.no_grad():
             given, batch = self._border.enter(state, control, parameters)
@@ -178,12 +179,12 @@ class Observables:
         """Return the masses of the cloths' vertices, differentiable in density and rest shape.
 
         Args:
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
             batch_size: Number of environments, >= 1; required if the parameters have a batch axis.
 
         Returns:
-            Mass of each vertex, a third of that of each face around it [kg], shape [N], or [B, N]
-            in a batch.
+            Mass of each vertex, a third of the mass of each adjacent face [kg], shape [N], or
+            [B, N] in a batch.
         """
         if batch_size is not None:
             check_count("vertex_masses: `batch_size`", batch_size, 1)
@@ -192,14 +193,14 @@ class Observables:
 
     @guarded
     def momentum(self, state: State, parameters: Parameters | None = None) -> Tensor:
-        """Return the momentum of everything that has mass, differentiable in both arguments.
+        """Return the momentum of all objects with mass, differentiable in both arguments.
 
         Momentum includes cloths with their pinned vertices, dynamic bodies, and all links of
-        dynamic robots. Bodies and robots that only follow prescribed motion have no mass.
+        dynamic robots. Bodies and robots with only prescribed motion have no mass.
 
         Args:
             state: The state.
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
 
         Returns:
             Linear momentum, then angular momentum about the origin of the world [kg m/s,
@@ -210,13 +211,13 @@ class Observables:
 
     @guarded
     def kinetic_energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
-        """Return the kinetic energy of what `momentum` includes, differentiable in both arguments.
+        """Return the kinetic energy of the objects in `momentum`, differentiable in both arguments.
 
         It includes the inertia of the drives, `joint_armature`, at joints under torque or pd.
 
         Args:
             state: The state.
-            parameters: Physical parameters; None takes those of the scene.
+            parameters: Physical parameters; None: the scene's.
 
         Returns:
             Energy [J], shape [], or [B] in a batch.
@@ -253,27 +254,28 @@ class Observables:
         control: Control | None = None,
         parts: bool = False,
     ) -> Tensor | dict[str, Tensor]:
-        """Potential energy at the positions of a state: elasticity, springs, gravity, contact.
+        """Return the potential energy of a state: elasticity, springs, gravity, contact.
 
-        Gravity is that of cloths, and of the bodies and robots that `momentum` counts; it is zero
-        at the origin of the world. What drives and stops of joints store is left out.
+        Gravity acts on cloths, and on the bodies and robots in `momentum`; its energy is zero at
+        the origin of the world. Energy in drives and stops of joints is left out.
 
-        A state does not hold where attachments pull to, nor their weights: a control does. Without
-        one, attachments between points pull with a weight of one, and those to targets not at all.
+        A state holds neither targets nor weights of attachments: a control does. By default,
+        attachments between points pull with a weight of one, and attachments to targets are
+        released.
 
-        All of it is differentiable in positions, poses, joints and targets of the state, in targets
-        and weights of the control, and in the parameters that it depends on; velocities, damping
-        and friction are not among them. The gradient by the positions of a cloth is minus the force
-        of these parts on it. All parts, and many losses with `is_grads_batched`, go back in one
-        call; a second derivative is refused.
+        All parts are differentiable in positions, poses, joints and targets of the state, in
+        targets and weights of the control, and in the parameters on which they depend; velocities,
+        damping and friction are not among these. The gradient by the positions of a cloth is minus
+        the force of these parts on it. Backward processes all parts, and many losses with
+        `is_grads_batched`, in one call; a second derivative is refused.
 
         Args:
-            state: Where things are.
-            parameters: Physical parameters; None takes those of the scene.
-            control: What acts there, as in a step. Of it `attachments`, `attachment_weights` and
-                `soft_pins` store energy; the rest, as forces and the motion of pins and bodies,
-                counts for nothing.
-            parts: Whether to return what adds up to the energy.
+            state: Positions, poses and joints at which the energy is evaluated.
+            parameters: Physical parameters; None: the scene's.
+            control: Control as in a step. Only `attachments`, `attachment_weights` and `soft_pins`
+                store energy; other fields, such as forces and the motion of pins and bodies, have
+                no effect.
+            parts: If true, return the parts of the energy.
 
         Returns:
             Energy [J], shape [], or [B] in a batch; with `parts` a dict of such tensors:
@@ -299,7 +301,7 @@ class Observables:
         return sum(rest, first)
 
     def _at_rest(self, given: Given) -> Fields:
-        """Inputs of the core where nothing moves: energy is that of where things are."""
+        """Inputs of the core without motion, as energy depends on positions alone."""
         weightless = {"gravity": torch.zeros_like(given.parameters["gravity"])}
         prediction = self._engine.predict(
             given.at_rest()._replace(parameters=given.parameters | weightless)
@@ -317,12 +319,12 @@ class Observables:
         return check
 
     def _totals(self, state: State, parameters: Parameters | None) -> tuple[Totals, int | None]:
-        """Momentum and energy of everything that has mass, and the batch size."""
+        """Momentum and energy of all objects with mass, and the batch size."""
         fields, batch = self._border.state(state)
         return self._engine.totals(fields, self._border.parameters(parameters, batch)), batch
 
     def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
-        """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
+        """Centers of mass of bodies or links, zero if nothing is dynamic; [B or 1, rows, 3]."""
         fields = self._border.parameters(parameters, batch)
         rows = self._engine.assembly.sizes["K" if owner == "body" else "L"]
         return fields.get(f"{owner}_center", cpu.zeros(1, rows, 3))

@@ -1,4 +1,4 @@
-"""The energies that a scene stores, as one differentiable operation with one backward."""
+"""The stored energies of a scene, as one differentiable operation with one backward."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["stored_energy"]
 
 
 def stored_energy(core: _core.Simulator, inputs: Fields) -> Fields:
-    """What potentials and the barrier store at the positions of inputs, differentiable in these.
+    """Energies of potentials and the barrier at the positions of inputs, differentiable in these.
 
     Args:
         core: The simulator in C++.

@@ -1,4 +1,4 @@
-"""Where surfaces touch at the end of a step, contact by contact."""
+"""Contact points between surfaces at the end of a step."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ class ContactPoints:
     """Contacts between surfaces at the end of a step, M of them.
 
     In a batch every tensor has a leading axis [B], and M is the largest number of contacts in an
-    environment; rows that are left have a `mask` of False, -1 for surfaces and 0 elsewhere.
+    environment; unused rows have a `mask` of False, -1 for surfaces and 0 elsewhere.
 
-    A row is a pair of features, as a vertex and a face or two edges, that the barrier keeps apart.
-    Friction uses contacts of the last solution but one: where features have changed since, it has
-    rows of its own, without a normal force. Rows may overlap at ridges and grooves of bodies, where
-    some have negative forces: what has a meaning are sums.
+    A row is a pair of features, such as a vertex and a face or two edges, that the barrier keeps
+    apart. Friction uses the contacts of the solution before the last: if features have changed
+    since, it has rows of its own, without a normal force. Rows may overlap at ridges and grooves of
+    bodies, and some of them then have negative forces: only sums are meaningful.
 
     Attributes:
-        surfaces: Names of all surfaces, of which `pairs` are indices.
-        mask: Whether a row is a contact, bool, shape [M].
+        surfaces: Names of all surfaces; `pairs` are indices into them.
+        mask: True for contacts, false for unused rows, bool, shape [M].
         pairs: Both surfaces of each contact, int64, shape [M, 2].
         points: Nearest points, on the first and on the second surface [m], shape [M, 2, 3].
         normals: Unit vectors from the first to the second [-], shape [M, 3].
-        gaps: Distances between them, less half the sum of both thicknesses [m], shape [M].
+        gaps: Distances between both points, minus half the sum of both thicknesses [m], shape [M].
         normal_forces: Forces of the first on the second along the normals [N], shape [M].
         tangential_forces: Friction of the first on the second [N], shape [M, 3].
     """
@@ -84,7 +84,7 @@ class ContactPoints:
         return self.normal_forces[..., None] * self.normals + self.tangential_forces
 
     def on(self, surface: str) -> ContactPoints:
-        """Contacts of one surface with others, which is then the second one in each row.
+        """Return contacts of one surface with others; it is then the second surface of each row.
 
         Rows of other surfaces, and of the surface with itself, have a mask of False and zeros.
 
@@ -120,7 +120,7 @@ class ContactPoints:
 
 
 def refuse_gradient(points: ContactPoints, by: Sequence[Tensor]) -> ContactPoints:
-    """The same contacts; a derivative of them by one of these tensors raises."""
+    """Return the same contacts; their derivatives by these tensors raise an error."""
     wanted = [tensor for tensor in by if is_differentiated((tensor,))]
     if not wanted:
         return points

@@ -1,4 +1,4 @@
-"""Which surfaces touch each other in a step, in how many contacts, and with which force."""
+"""Surfaces in contact after a step: number of contacts and net force of each pair."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Contacts:
                 contact.
             rows: For each environment, its single contacts.
             surfaces: Names of all surfaces.
-            batched: Whether the result has an axis of environments.
+            batched: True if the result has an axis of environments.
         """
         counts: dict[tuple[int, int], NDArray[np.int64]] = {}
         forces: dict[tuple[int, int], FloatArray] = {}

@@ -1,4 +1,4 @@
-"""What a caller sets in a step: targets for its end, forces, and physical parameters."""
+"""Inputs of a step besides the state: targets for its end, forces, and physical parameters."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ class Control:
     A control is a pytree of torch: its leaves are the tensors that are set.
 
     Attributes:
-        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" if that
-            is unique) -> positions; pins that are not named stay in place.
+        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" if
+            unique) -> positions; pins that are not named stay in place.
         soft_pins: Positions to which the soft pins pull [m], shape [Q, 3], or likewise by name.
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7], or body -> pose [7];
-            the row of a body that is not kinematic must equal that of the state.
+            the row of a body that is not kinematic must equal the row of the state.
         forces: Forces on the cloth vertices [N], shape [N, 3]; none by default.
         body_wrenches: Force at the center of mass of each dynamic body, then torque, in world axes
             [N, N m], shape [K, 6], or body -> wrench [6]; must be zero for a body that is not
             dynamic.
         joint_positions: Targets of position and pd joints [rad or m], shape [J], or "robot/joint"
-            (or "joint" if that is unique) -> number; rows of other joints are ignored, here and in
-            the next two, and pd joints that are not named keep their last target.
+            (or "joint" if unique) -> number; rows of other joints are ignored, here and in the next
+            two, and pd joints that are not named keep their last target.
         joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
             by name; zero by default.
-        joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],
-            shape [J], or likewise by name; zero by default. What is beyond the limits of a joint
-            does not act.
+        joint_efforts: Efforts of torque joints, and efforts added to the efforts of pd drives
+            [N m or N], shape [J], or likewise by name; zero by default. Efforts are clamped to the
+            limits of a joint.
         base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
-            a robot whose base is not kinematic must equal that of the state.
+            a robot whose base is not kinematic must equal the row of the state.
         base_wrenches: Force at the center of mass of each floating root link, then torque, in world
             axes [N, N m], shape [R, 6], or robot -> wrench [6]; must be zero for a base that is not
             floating.
-        attachments: Targets of the attachments that have some [m], shape [U, 3], or attachment ->
-            targets [n, 3]. Those that are not set are released.
+        attachments: Targets of the attachments to targets [m], shape [U, 3], or attachment ->
+            targets [n, 3]. Attachments without a target are released.
         attachment_weights: Share of the stiffness with which the springs of attachments pull [-],
-            between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and
-            0 where a target is not set.
+            between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and 0
+            if a target is not set.
         wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Faces whose
             material has drag feel it.
         body_vertices: Positions of the vertices of deforming bodies [m], shape [D, 3], or body ->
@@ -78,7 +78,7 @@ class Control:
         return _text(self, CONTROL)
 
     def replace(self, **changes: Any) -> Control:
-        """Copy with some fields replaced."""
+        """Return a copy with some fields replaced."""
         check_field_names("Control.replace", self, changes)
         return replace(self, **changes)
 
@@ -86,19 +86,18 @@ class Control:
 @saved
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Physical parameters. A field that is None takes what the scene has, if anything.
+    """Physical parameters. A field that is None has the values of the scene.
 
     Each may have a leading batch axis [B]. The friction and the barrier stiffness of a pair of
     surfaces are the mean of its two entries.
 
     A field at faces may have one value per cloth vertex, [N]: a face then has the mean of its
-    corners. Where there are as many vertices as faces, such a tensor is refused.
+    corners. Such a tensor is refused if there are as many vertices as faces.
 
-    What has rows may be given by names, as {"shirt": 300.0}: what is per cloth or face by cloths,
-    `thickness` by surfaces, `attachment_stiffness` by attachments, the rest by bodies, by
-    "robot/link" or by "robot/joint" (or the part behind the slash where it is unique, or a robot
-    for all of its rows). What is not named keeps
-    what the scene has.
+    Fields with rows may be set by names, as {"shirt": 300.0}: fields per cloth or face by cloths,
+    `thickness` by surfaces, `attachment_stiffness` by attachments, all others by bodies, by
+    "robot/link" or by "robot/joint" (or the part after the slash if unique, or a robot for all of
+    its rows). Rows that are not named keep the values of the scene.
 
     Parameters are a pytree of torch: their leaves are the tensors that are set.
 
@@ -118,29 +117,29 @@ class Parameters:
         pin_stiffness: Stiffness of the soft pins [N/m], > 0; shape [] or [C].
         gravity: Acceleration of gravity [m/s^2], shape [3].
         rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
-        attachment_stiffness: Of the springs of attachments [N/m], > 0, shape [A].
+        attachment_stiffness: Stiffness of the springs of attachments [N/m], > 0, shape [A].
         normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C], [N]
             or [F].
         tangential_drag: Coefficient of the friction of air along faces [-], >= 0; shape [], [C],
             [N] or [F].
         air_density: Density of the air [kg/m^3], >= 0; shape [].
-        body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
-            next two are ignored where the body is not dynamic.
-        body_center: Its center of mass, in its frame [m], shape [K, 3].
-        body_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
-            symmetric part is meant and must be positive definite; shape [K, 3, 3].
+        body_mass: Mass of each body [kg], >= 0, > 0 if it is dynamic; shape [K]. This and the next
+            two are ignored for bodies that are not dynamic.
+        body_center: Center of mass of each body, in its frame [m], shape [K, 3].
+        body_inertia: Inertia of each body about that center, in the axes of its frame [kg m^2].
+            Only the symmetric part is used, which must be positive definite; shape [K, 3, 3].
         link_mass: Mass of each link [kg], >= 0, shape [L].
         link_center: Center of mass of each link, in its frame [m], shape [L, 3].
-        link_inertia: Inertia of each link about that center, in the axes of its frame [kg m^2];
-            only the symmetric part counts; shape [L, 3, 3].
+        link_inertia: Inertia of each link about that center, in the axes of its frame [kg m^2].
+            Only the symmetric part is used; shape [L, 3, 3].
         joint_stiffness: Stiffness of pd drives [N m/rad or N/m], >= 0, shape [J].
         joint_damping: Damping of pd drives [N m s/rad or N s/m], >= 0, shape [J].
         joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
         joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
         stretch_weft: Membrane stiffness of woven cloth along its weft [N/m], > 0; shape [], [C],
-            [N] or [F]. This and the next three exist where a material sets one of the kind; then
-            `stretch` and `bending` are those along the warp, also of cloths that are isotropic,
-            which keep their own numbers here.
+            [N] or [F]. This and the next three exist if a material sets such a stiffness. `stretch`
+            and `bending` are then the stiffnesses along the warp; isotropic cloths of the scene
+            have their own values here.
         stretch_shear: Membrane stiffness of woven cloth in shear [N/m], > 0; shape [], [C], [N] or
             [F].
         bending_weft: Bending stiffness of woven cloth along its weft [N m], >= 0; shape [], [C],
@@ -148,14 +147,14 @@ class Parameters:
         bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C],
             [N] or [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) /
             4.
-        joint_effort_limits: Largest efforts of pd drives, and of what is applied to torque joints
-            [N m or N], > 0, shape [J]; 1e30 where there is no limit.
+        joint_effort_limits: Largest efforts of pd drives, and largest efforts applied to torque
+            joints [N m or N], > 0, shape [J]; 1e30 if there is no limit.
         joint_velocity_limits: Largest speeds of pd and torque joints [rad/s or m/s], > 0, shape
-            [J], likewise.
+            [J]; 1e30 if there is no limit.
         joint_friction: Coulomb friction of these joints [N m or N], >= 0, shape [J].
         joint_slip_rates: Speeds at which sticking joints turn into sliding ones [rad/s or m/s],
-            > 0, shape [J]; by default those at which the joint moves what it carries by
-            `ContactOptions.slip_velocity`, at the radius of gyration about its axis.
+            > 0, shape [J]. By default, the joint then moves its load with
+            `ContactOptions.slip_velocity` at the radius of gyration about its axis.
     """
 
     stretch: Tensor | None = None
@@ -193,21 +192,21 @@ class Parameters:
     joint_velocity_limits: Tensor | None = None
     joint_friction: Tensor | None = None
     joint_slip_rates: Tensor | None = None
-    # Fields that a simulator made without a batch axis: their [C] or [F] is never read as [B].
+    # Fields from a simulator, without a batch axis: their [C] or [F] is never read as [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         return _text(self, PARAMETERS)
 
     def replace(self, **changes: Any) -> Parameters:
-        """Copy with some fields replaced."""
+        """Return a copy with some fields replaced."""
         check_field_names("Parameters.replace", self, changes)
         unbatched = tuple(name for name in self._unbatched if name not in changes)
         return replace(self, **changes, _unbatched=unbatched)
 
 
 def _set_fields(record: Control | Parameters, names: Iterable[str]) -> dict[str, Any]:
-    """Fields that a record sets; mappings as dicts, which are pytrees."""
+    """Fields that a record sets; mappings become dicts, which are pytrees."""
     values = {name: getattr(record, name) for name in names}
     return {
         name: dict(value) if isinstance(value, Mapping) else value
@@ -222,7 +221,7 @@ def _parameter_branches(record: Parameters) -> tuple[dict[str, Any], dict[str, A
 
 
 def _restored_parameters(fields: dict[str, Any], shapes: dict[str, Any]) -> Parameters:
-    """Parameters whose fields of another shape than the simulator's may have a batch axis."""
+    """Restore parameters; fields of another shape than the simulator's may have a batch axis."""
     unbatched = (n for n, shape in shapes.items() if getattr(fields[n], "shape", None) == shape)
     return Parameters(**fields, _unbatched=tuple(unbatched))
 

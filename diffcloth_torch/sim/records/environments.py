@@ -1,4 +1,4 @@
-"""Selection, stacking and choice of environments, written once for all records of a step.
+"""Selection, stacking and choice of environments, shared by all records of a step.
 
 A record combines each of its entries by one of three rules: tensors with a leading axis of
 environments; numbers, which are plain numbers without that axis; and items, one for each
@@ -22,7 +22,7 @@ Items = tuple[Any, ...]
 
 
 class Combination(ABC):
-    """How entries of records become the entry of another record.
+    """Combination of entries of several records into the entry of another record.
 
     Attributes:
         size: Environments of the result, None if it has no axis of environments.
@@ -90,8 +90,8 @@ class Choice(Combination):
 
         Args:
             mask: Booleans, [B].
-            batched: Whether each of the two records has an axis of environments; the other has one
-                environment for all.
+            batched: For each of the two records, true if it has an axis of environments; otherwise
+                its only environment is used for all.
         """
         self._mask, self._batched = mask, batched
         self.size = len(mask)

@@ -25,52 +25,52 @@ __all__ = ["Report", "combine_reports", "outcome_text"]
 @saved
 @dataclass(frozen=True, eq=False)
 class Report:
-    """How a step went, in Python numbers, or in tensors of shape [B] in a batch.
+    """Outcome of a step, in Python numbers, or in tensors of shape [B] in a batch.
 
     Attributes:
-        converged: Whether every solve of the step ended in a local minimum: the exact Hessian is
+        converged: True if every solve of the step ended in a local minimum: the exact Hessian is
             positive definite there, and the Newton step is below the tolerance. For Projective
-            Dynamics, whether the residual is below the tolerance.
+            Dynamics, true if the residual is below the tolerance.
         iterations: Newton iterations of all solves of the step, including its prescribed motion.
         residual: Largest displacement of the last Newton step, as a velocity [m/s]; for Projective
-            Dynamics, the largest change of velocity by the residual force. The largest of them if
-            there are several solves.
-        minimum_distance: Smallest distance between mid-surfaces in contact [m], of smooth bodies
-            and links between the round surfaces, always above half the sum of their thicknesses;
+            Dynamics, the largest change of velocity by the residual force. The largest value of all
+            solves.
+        minimum_distance: Smallest distance between mid-surfaces in contact [m]; for smooth bodies
+            and links, between the round surfaces. Always above half the sum of their thicknesses;
             infinite if nothing is within the barrier's reach.
         contact_count: Contacts within the barrier distance: pairs of primitives between cloths;
             between a cloth and a body, features that are not hidden behind nearer ones; in
             "projective", vertices that stick or slip.
         motion_fraction: Fraction of the prescribed motion that was completed, 1 for all of it.
-        seconds: Phase of the step -> time [s]; the phases add up to the time in the core, by the
-            clock of the wall, which also counts while other work has the processor.
+        seconds: Phase of the step -> wall-clock time [s], which includes the time of other work on
+            the processor; the phases add up to the time in the core.
         counts: Event -> number of times: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
-            `local_global` iterations of Projective Dynamics, solves that they `left_to_newton`,
-            numeric `factorizations` including failed ones, those of them `in_doubles`, and symbolic
-            `analyses`; vertices in dry frictional contact that are `taking_off`, `sticking` and
-            `slipping`.
+            `local_global` iterations of Projective Dynamics, solves `left_to_newton` by Projective
+            Dynamics, numeric `factorizations` including failed ones, factorizations `in_doubles`,
+            and symbolic `analyses`; vertices in dry frictional contact that are `taking_off`,
+            `sticking` and `slipping`.
         status: "converged", "not_converged", "infeasible_motion" or "turned_too_far"; in a batch a
-            tuple of B of them. In the report of an `IntersectingState`, environments that intersect
+            tuple of B texts. In the report of an `IntersectingState`, environments that intersect
             have "intersecting_state".
-        cpu_seconds: Processor time of the step in the core [s], of all threads that work on the
-            environment; NaN where it is not known.
+        cpu_seconds: Processor time of the step in the core [s], summed over all threads of the
+            environment; NaN if unknown.
         contacts: Contacts by pairs of names of surfaces: `contacts["gripper/left", "shirt"]` has
             `count` and `force`.
-        criterion: Criterion that ended the solve of the core that decided the step, its last one or
-            the first that failed; in a batch a tuple of B of them. Converged: "tolerance", the
-            Newton step or the residual of Projective Dynamics is below the tolerance; "rounding",
-            likewise, and rounding hides further progress. Not converged: "iteration_limit";
-            "time_limit"; "precision_limit", rounding hides steps above the tolerance; "no_descent",
-            no step along the last direction lowers the energy; "blocked", collisions leave no part
-            of the last direction; "indefinite", not even the projected Hessian has a factor;
-            "not_finite", forces are not finite; "saddle", forces balance at an indefinite Hessian;
-            "no_solution", the law of friction at vertices is not satisfied; "stuck_motion", the
-            prescribed motion no longer advances. "no_solve" if surfaces intersect at the start,
-            "unknown" in reports of earlier versions.
-        certified: Whether each solve of the step ended with a positive definite Hessian, see
-            `SolverOptions.certify`; False for the iterations of Projective Dynamics, which form
-            none, and for steps that have not converged.
+        criterion: Criterion that ended the deciding solve of the core: the first that failed, else
+            the last; in a batch a tuple of B texts. Converged: "tolerance", the Newton step or the
+            residual of Projective Dynamics is below the tolerance; "rounding", likewise, and
+            rounding hides further progress. Not converged: "iteration_limit"; "time_limit";
+            "precision_limit", rounding hides steps above the tolerance; "no_descent", no step along
+            the last direction lowers the energy; "blocked", collisions leave no part of the last
+            direction; "indefinite", not even the projected Hessian has a factor; "not_finite",
+            forces are not finite; "saddle", forces balance at an indefinite Hessian; "no_solution",
+            the law of friction at vertices is not satisfied; "stuck_motion", the prescribed motion
+            no longer advances. "no_solve" if surfaces intersect at the start, "unknown" in reports
+            of earlier versions.
+        certified: True if each solve of the step ended with a positive definite Hessian, see
+            `SolverOptions.certify`. False for the iterations of Projective Dynamics, which form no
+            Hessian, and for steps that have not converged.
     """
 
     converged: bool | Tensor
@@ -83,9 +83,9 @@ class Report:
     counts: dict[str, int | Tensor] = field(default_factory=dict)
     status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
     contacts: Contacts = field(default_factory=Contacts)
-    cpu_seconds: float | Tensor | None = None  # if left out, not known
-    criterion: str | tuple[str, ...] = ()  # if left out, not known
-    certified: bool | Tensor | None = None  # if left out, that of `converged`
+    cpu_seconds: float | Tensor | None = None  # if left out, unknown
+    criterion: str | tuple[str, ...] = ()  # if left out, unknown
+    certified: bool | Tensor | None = None  # if left out, equal to `converged`
 
     def __post_init__(self) -> None:
         if self.cpu_seconds is None:
@@ -114,7 +114,7 @@ class Report:
                 )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Checks the fields, and completes a report of 0.1, which lacks the last three.
+        # Checks the fields, and completes a report of version 0.1, which lacks the last three.
         self.__init__(**state)  # type: ignore[misc]
 
     def __repr__(self) -> str:
@@ -134,7 +134,7 @@ class Report:
         return record_text("Report", parts)
 
     def check_environments(self, owner: str, count: int | None) -> None:
-        """Require tensors of shape [count], or numbers where there is no batch axis."""
+        """Require tensors of shape [count], or numbers if there is no batch axis."""
         shape = [] if count is None else [count]
         for name in (*_NUMERIC, *_TEXTS):
             value = getattr(self, name)
@@ -146,19 +146,19 @@ class Report:
                     )
 
     def select(self, index: int | slice | Tensor) -> Report:
-        """Report of one environment of a batch, or of several."""
+        """Return the report of one environment of a batch, or of several."""
         selected = combine_reports(Selection(index, len(self.status)), [self])
         assert selected is not None  # one report agrees with itself
         return selected
 
     @staticmethod
     def stack(reports: Sequence[Report | None]) -> Report | None:
-        """Report of a batch from those of its environments; None if one of them is missing."""
+        """Return the report of a batch from its environments' reports; None if one is missing."""
         return combine_reports(Stack(len(reports)), reports)
 
     @staticmethod
     def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
-        """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
+        """Choose environments of `a` where `mask` is true, else of `b`; None if one is missing."""
         batched = [report is not None and not isinstance(report.status, str) for report in (a, b)]
         return combine_reports(Choice(mask, batched), [a, b])
 
@@ -226,14 +226,14 @@ def _range_text(values: Any) -> str:
 
 
 def _status_text(status: str | tuple[str, ...]) -> str:
-    """Text of a status or criterion, or of how many environments have each."""
+    """Text of a status or criterion, or of the number of environments with each."""
     if isinstance(status, str):
         return repr(status)
     return f"{{{', '.join(f'{name}: {n}' for name, n in Counter(status).items())}}}"
 
 
 def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
-    """Status of steps of which only `converged` is known."""
+    """Status of steps for which only `converged` is known."""
     names = ("not_converged", "converged")
     if isinstance(converged, Tensor) and converged.dim() > 0:
         return tuple(names[is_true] for is_true in converged.bool().flatten().tolist())

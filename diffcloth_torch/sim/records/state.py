@@ -42,13 +42,14 @@ class State:
     """Positions, velocities and forces at one time. All tensors may share a leading batch axis.
 
     Attributes:
-        positions: Positions of the cloth vertices, then of those of deforming bodies [m], shape
-            [N, 3].
+        positions: Positions of the cloth vertices, then of the vertices of deforming bodies [m],
+            shape [N, 3].
         velocities: Velocities of these vertices [m/s], shape [N, 3].
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
-        soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
-        body_forces: Forces of contact and attachments on the body vertices, of smooth ones on
-            four points that move with them, during the step that led here [N], shape [V, 3].
+        soft_pin_targets: Targets of the soft pins [m], shape [Q, 3].
+        body_forces: Forces of contact and attachments on the body vertices during the step that led
+            here [N], shape [V, 3]. Smooth bodies have four points that move with them instead of
+            vertices.
         time: Time since the initial state [s], shape [].
         report: Report of the step that led here; None in an initial state.
         body_velocities: Velocity of each body's center of mass, then its angular velocity, in world
@@ -56,8 +57,8 @@ class State:
             the body is dynamic.
         joint_positions: Positions of the joints [rad or m], shape [J].
         joint_velocities: Velocities of the joints [rad/s or m/s], shape [J].
-        joint_targets: Positions to which pd drives pull until a control changes them [rad or m],
-            shape [J].
+        joint_targets: Position targets of pd drives, which hold until a control changes them
+            [rad or m], shape [J].
         joint_efforts: Efforts of the drives during the step that led here [N m or N], within their
             limits and without the friction of the joints, shape [J]. For a prescribed joint, the
             effort that its motion required against inertia, weights and contact, without the
@@ -70,8 +71,8 @@ class State:
         pin_forces: Forces that held the pinned vertices during that step [N], shape [P, 3].
 
     A state is a pytree of torch with these tensors as leaves: `tree_map`, `torch.func` and
-    `torch.vmap` take it. `torch.utils.data.default_collate` stacks states without a batch axis.
-    Both drop the report: it describes a step that did not lead to the new state.
+    `torch.vmap` accept it. `torch.utils.data.default_collate` stacks states without a batch axis.
+    Both drop the report, which describes a step that did not lead to the new state.
     """
 
     positions: Tensor
@@ -105,7 +106,7 @@ class State:
                 object.__setattr__(self, name, zeros)
 
     def __repr__(self) -> str:
-        # Tensors without rows, of things that the scene lacks, are left out.
+        # Tensors without rows, for entities that the scene lacks, are left out.
         tensors = {name: getattr(self, name) for name in ("time", *_TENSORS)}
         there = {n: t for n, t in tensors.items() if not isinstance(t, Tensor) or t.numel()}
         parts = [field_text(name, value) for name, value in there.items()]
@@ -121,16 +122,16 @@ class State:
         return self.positions.shape[0] if batched else None
 
     def replace(self, **changes: Any) -> State:
-        """Copy with some fields replaced; the other tensors are shared."""
+        """Return a copy with some fields replaced; the other tensors are shared."""
         check_field_names("State.replace", self, changes)
         return replace(self, **changes)
 
     def detach(self) -> State:
-        """Copy whose tensors carry no graph."""
+        """Return a copy whose tensors carry no graph."""
         return self._map(lambda tensor: tensor.detach(), self.report)
 
     def clone(self) -> State:
-        """Copy that shares no memory; gradients flow to the original."""
+        """Return a copy that shares no memory; gradients flow to the original."""
         return self._map(lambda tensor: tensor.clone(), self.report)
 
     def to(
@@ -141,18 +142,18 @@ class State:
         non_blocking: bool = False,
         copy: bool = False,
     ) -> State:
-        """Return the state, which stays in float64 on the CPU, as loops that move batches do.
+        """Return the state unchanged, for code that moves batches: it stays in float64 on the CPU.
 
         Args:
             *targets: Devices, dtypes or tensors, as for `torch.Tensor.to`.
             device: A device.
             dtype: A dtype.
             non_blocking: Ignored: nothing is moved.
-            copy: Whether to copy the tensors.
+            copy: If true, copy the tensors.
 
         Raises:
             InvalidInput: If a device is not the CPU.
-            TypeError: If a dtype is not float64, or a target is none of these.
+            TypeError: If a dtype is not float64, or a target is no device, dtype or tensor.
         """
         for target in (*targets, device, dtype):
             _require_float64_on_cpu(target)
@@ -217,7 +218,7 @@ class State:
 
         Args:
             path: File ending in .obj (one object per surface) or .ply (all surfaces in one mesh).
-            bodies: Whether to write the bodies and links, at their poses, after the cloths.
+            bodies: If true, also write the bodies and links, at their poses, after the cloths.
 
         Raises:
             InvalidInput: If the state is a batch, was not made by a simulator, or `path` has
@@ -246,7 +247,7 @@ _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
 def _require_float64_on_cpu(target: Any) -> None:
-    """Refuse a target of `State.to` that changes a state."""
+    """Refuse a target of `State.to` that would change a state."""
     where: Any = None if isinstance(target, torch.dtype) else target
     dtype = target if isinstance(target, torch.dtype) else None
     if isinstance(target, Tensor):
@@ -342,7 +343,7 @@ def _combined(how: Combination, states: Sequence[State]) -> State:
 
 
 def check_shapes(owner: str, which: str, states: Sequence[tuple[str, State]]) -> None:
-    """Require fields of the same shapes, but for the axis of environments."""
+    """Require equal shapes of fields, except for the axis of environments."""
     for name in _TENSORS:
         shapes = [
             list(getattr(state, name).shape[state.batch_size is not None :]) for _, state in states
@@ -356,7 +357,7 @@ def check_shapes(owner: str, which: str, states: Sequence[tuple[str, State]]) ->
 
 
 def check_state(name: str, state: Any) -> None:
-    """Require a State whose fields have the right types and batch size: it may come from a file."""
+    """Require a State with fields of the right types and batch size, as it may come from a file."""
     if not isinstance(state, State):
         raise TypeError(f"{name} must be a State, got {type(state).__name__}")
     for entry in _TENSORS:

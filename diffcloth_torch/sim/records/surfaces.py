@@ -1,8 +1,8 @@
 """Every surface of a scene, placed at a state: cloths, bodies, links with collision shapes.
 
-Exported meshes, pictures, wrenches and the staggered couplings get their vertices and frames here.
-A state carries the surfaces as plain tensors, so that a saved state can be exported without its
-scene.
+Exported meshes, pictures, wrenches and the staggered couplings use the vertices and frames of this
+module. A state carries the surfaces as plain tensors, so that a saved state can be exported without
+its scene.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Surfaces:
 
     def link_frames(self, state: Mapping[str, Tensor]) -> ByName:
         """Frames of all links, without the bodies."""
-        if not self.robots:  # then the fields of a step lack theirs
+        if not self.robots:  # fields of a step may lack base poses and joints
             return {}
         bases, first = pose_frame(state["base_poses"]), 0
         named: ByName = {}

@@ -24,7 +24,7 @@ from diffcloth_torch.sim.records.state import State, check_shapes, check_state
 
 __all__ = ["Trajectory", "check_ending"]
 
-_FILES = (".pt", ".npz")  # of data; the others are animations
+_FILES = (".pt", ".npz")  # with data; the others are animations
 
 
 class Trajectory(list[State]):
@@ -60,11 +60,11 @@ class Trajectory(list[State]):
         return f"Trajectory({len(self)} states)"
 
     def detach(self) -> Trajectory:
-        """Copy whose tensors carry no graph."""
+        """Return a copy whose tensors carry no graph."""
         return Trajectory(state.detach() for state in self)
 
     def save(self, path: str | Path) -> None:
-        """Write the states without their graph, in the format that the ending names.
+        """Write the states without their graph, in the format of the file's ending.
 
         - .pt: the states with reports and surfaces; `load` reads it.
         - .npz: arrays in float64, also of a batch: `times` [T]; `positions/cloth` and
@@ -83,7 +83,7 @@ class Trajectory(list[State]):
         Raises:
             InvalidInput: If the ending is another one, or the format cannot hold the states.
             TypeError: If an item is not a State.
-            OSError: If it cannot be written.
+            OSError: If the file cannot be written.
         """
         for i, state in enumerate(self):
             check_state(f"Trajectory.save: the state [{i}]", state)
@@ -164,21 +164,21 @@ class Trajectory(list[State]):
 
     @staticmethod
     def load(path: str | Path) -> Trajectory:
-        """Read a trajectory that `save` has written to a .pt file.
+        """Read a trajectory from a .pt file that `save` has written.
 
         Args:
             path: The file.
 
         Raises:
             InvalidInput: If the file holds anything else.
-            OSError: If it cannot be read.
+            OSError: If the file cannot be read.
         """
         file = as_path("Trajectory.load: `path`", path)
         try:
             states: Any = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
         except OSError:
             raise
-        except Exception as error:  # whatever the reader makes of bytes that are not its own
+        except Exception as error:  # any error of the reader about the bytes of another format
             raise InvalidInput(f"Trajectory.load: {file} holds no trajectory: {error}") from error
         if not isinstance(states, list):
             kind = type(states).__name__
@@ -203,7 +203,7 @@ def check_ending(name: str, file: Path) -> str:
     """Return the ending of a file for states, in lower case.
 
     Args:
-        name: Opens the message.
+        name: Prefix of the message.
         file: The file.
 
     Raises:

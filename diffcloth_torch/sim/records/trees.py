@@ -1,4 +1,4 @@
-"""Records as pytrees of torch: `tree_map`, `torch.func` and `torch.vmap` take them."""
+"""Records as pytrees of torch, for `tree_map`, `torch.func` and `torch.vmap`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Branches = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class _Structure:
-    """Names of the fields of a record, and its parts that are no branches.
+    """Names of the fields of a record, and its other parts, which are no branches.
 
     Two records with fields of the same names have one structure, and a function of several trees
     returns the other parts of the first one.

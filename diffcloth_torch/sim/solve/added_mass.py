@@ -1,4 +1,4 @@
-"""When a staggered coupling gets inaccurate: if a body touches cloth that is heavy or stiff."""
+"""Warning for inaccurate staggered couplings: a body touches heavy or stiff cloth."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class AddedMassWatch:
         dynamics: Dynamics,
         cores: tuple[Core, Core],
     ) -> None:
-        """Keep what steps are judged by.
+        """Keep the data for checks of steps.
 
         Args:
             coupling: Name of the coupling.
             layout: Meaning of the rows.
             surfaces: The surfaces that a state places.
             dynamics: Dynamics of the bodies and robots.
-            cores: Core of the cloths, then that of bodies and robots alone.
+            cores: Core of the cloths, and core of bodies and robots alone.
         """
         self._coupling, self._layout, self._surfaces = coupling, layout, surfaces
         self._dynamics = dynamics
@@ -70,7 +70,7 @@ class AddedMassWatch:
             given: Checked state, control and parameters of the step.
             inputs: Inputs of the core that do not concern bodies and robots.
             solved: Result of the step.
-            blocked: Whether a motion could not be completed.
+            blocked: True if a motion could not be completed.
         """
         cloth = solved.cloth.outcome
         if self._warned or not cloth.body_forces.any():
@@ -81,7 +81,7 @@ class AddedMassWatch:
             self._warn(cloth, solved.fields, given.parameters, gain)
 
     def _is_passive(self, state: Fields, control: Fields) -> bool:
-        """Whether only gravity does work: nothing else pushes, and what is prescribed rests."""
+        """Return whether only gravity does work: no other force acts, prescribed objects rest."""
         springs = len(self._layout.assembly.springs) > 0
         if (
             springs
@@ -101,7 +101,7 @@ class AddedMassWatch:
         parameters: Fields,
         inputs: Fields,
     ) -> float:
-        """Largest rise of the energy over a step, as a fraction of that of motion and contact."""
+        """Largest rise of the energy over a step, relative to the energy of motion and contact."""
         cloth, moved = solved.cloth.outcome, solved.prediction
         after = {"positions": cloth.positions, "velocities": cloth.velocities, **solved.fields}
         here = inputs | moved.core_inputs()
@@ -130,13 +130,13 @@ class AddedMassWatch:
         return totals.kinetic_energy, contact, rest
 
     def _warn(self, cloth: Outcome, after: Fields, parameters: Fields, gain: float) -> None:
-        """Warn once if a body touches cloth that is not light compared to it.
+        """Warn once if a body touches cloth that is not light compared to the body.
 
         Args:
             cloth: Outcome of the cloths' solve.
             after: Fields of bodies and robots after the step.
             parameters: Checked parameters.
-            gain: Fraction of the energy that the step has created.
+            gain: Relative increase of energy by the step.
         """
         assembly = self._layout.assembly
         numbers = added_mass_numbers(

@@ -53,7 +53,7 @@ class CoreOptions(NamedTuple):
         scheme: "coupled", "split" or "projective".
         contact: Contact options.
         solver: Solver options.
-        begins_at_state: Whether solves begin where the step does, not where inertia leads.
+        begins_at_state: If true, solves begin at the start of the step, not at the inertial guess.
         integrator: "implicit_euler" or "second_order", of the scheme "coupled".
     """
 
@@ -80,7 +80,7 @@ def make_core(
         options: Options of the core.
         limit_stiffness: Stiffness of the barriers at the limits of coordinates; None if
             all bodies move on prescribed poses.
-        all_prescribed: Whether the motion of all coordinates is prescribed.
+        all_prescribed: True if the motion of all coordinates is prescribed.
     """
     trees: dict[str, Any] = {}
     if limit_stiffness is not None:
@@ -134,7 +134,7 @@ def make_core(
 
 
 def core_inputs(state: Fields, control: Fields, parameters: Fields) -> Fields:
-    """Fields by the core's names."""
+    """Return fields by the core's names."""
     return {
         core: fields[name]
         for names, fields in zip(_CORE_NAMES, (state, control, parameters), strict=True)
@@ -155,7 +155,7 @@ def arrays_of(inputs: Fields) -> dict[str, FloatArray]:
 
 
 def rigid_inputs(layout: Layout, inputs: Fields) -> Fields:
-    """Select the inputs of bodies and links from those of a scene."""
+    """Select the inputs of bodies and links from the inputs of a scene."""
     assembly = layout.assembly
     cloths, surfaces = assembly.cloth_count, assembly.surface_count
     none = cpu.zeros(len(inputs["positions"]), 0, 3)
@@ -175,10 +175,10 @@ def rigid_inputs(layout: Layout, inputs: Fields) -> Fields:
 
 
 def with_deforming_bodies(layout: Layout, given: Given) -> Fields:
-    """Inputs of the core of which deforming bodies have rows of their own.
+    """Inputs of the core in which deforming bodies have rows of their own.
 
-    Their vertices are pins, the last ones. They have no stiffness (`Border`) and no mass, but the
-    core divides by masses, also by those that nothing feels: it gets the smallest of the cloths.
+    Their vertices are the last pins. They have no stiffness (`Border`) and no mass, but the core
+    divides by masses, even where they have no effect: it gets the smallest density of the cloths.
     """
     density = given.parameters["density"]
     elastic = layout.elastic[density.shape[1]]
@@ -191,7 +191,7 @@ def with_deforming_bodies(layout: Layout, given: Given) -> Fields:
 
 
 def without_cloths(assembly: Assembly) -> Assembly:
-    """The same scene without its cloths."""
+    """Return the scene without its cloths."""
     cloths = assembly.cloth_count
     pairs = assembly.ignored_pairs
     return replace(
@@ -214,7 +214,7 @@ def without_cloths(assembly: Assembly) -> Assembly:
 
 
 def with_all_pinned(assembly: Assembly) -> Assembly:
-    """The same scene with all cloth vertices pinned, so that nothing moves by itself."""
+    """Return the scene with all cloth vertices pinned, so that nothing moves by itself."""
     return replace(
         assembly,
         deforming_count=0,

@@ -46,7 +46,7 @@ __all__ = ["Engine"]
 
 Diagnostics = dict[str, Any]
 Check = Callable[[Diagnostics], None]
-"""Raises where the diagnostics of a solve say that it failed."""
+"""Raises an error if the diagnostics of a solve show a failure."""
 
 
 class Engine:
@@ -75,7 +75,7 @@ class Engine:
         begins_at_state: bool = False,
         integrator: str = INTEGRATORS[0],
     ) -> None:
-        """Make the cores; the arguments are those of `Simulator`, checked.
+        """Make the cores; the arguments are the checked arguments of `Simulator`.
 
         Args:
             scene: The scene.
@@ -86,7 +86,7 @@ class Engine:
             contact: Options of contact.
             solver: Options of the solver.
             weight: As for `Dynamics`.
-            limits_dt: Time step that sets the stiffness of joint limits; None takes `dt`.
+            limits_dt: Time step that sets the stiffness of joint limits; None: `dt`.
             begins_at_state: As for `CoreOptions`.
             integrator: Name of the integrator.
         """
@@ -95,7 +95,7 @@ class Engine:
         self.dynamics = Dynamics(assembly, dt, weight) if layout.has_coordinates else None
         self.surfaces = Surfaces.of(scene, assembly)
         self.constants: Mapping[str, Constant] = {}
-        # Without cloths there is nothing to split or to couple.
+        # A scene without cloths has nothing to split or to couple.
         options = CoreOptions(
             bending_models=[cloth.bending_model for cloth in scene.cloths],
             dt=dt,
@@ -138,14 +138,14 @@ class Engine:
         origins: Tensor | None = None,
         joint_origins: Tensor | None = None,
     ) -> tuple[Fields, Diagnostics]:
-        """Take a step.
+        """Compute a step.
 
         Args:
             given: Checked state, control and parameters.
             check: Checks the diagnostics of each solve.
-            origins: Positions of all vertices, from which friction counts motion, [B, N + V, 3] m;
-                None takes the start of the step, or what a staggered coupling chooses.
-            joint_origins: The same for the values of joints and their friction, [B, J].
+            origins: Positions of all vertices from which friction measures motion, [B, N + V, 3] m;
+                None: the start of the step, or the choice of a staggered coupling.
+            joint_origins: Values of joints from which their friction measures motion, [B, J].
 
         Returns:
             Fields of the next state except the time, [B, ...], and the diagnostics. Backward
@@ -178,7 +178,7 @@ class Engine:
         origins: Tensor | None,
         joint_origins: Tensor | None,
     ) -> tuple[Outcome, Fields]:
-        """Solve for everything at once; the outcome, and fields of bodies and robots after it."""
+        """Solve for all objects at once; return the outcome, and fields of bodies and robots."""
         prediction = self.predict(given, joint_origins)
         inputs = self.core_inputs(given, prediction)
         if origins is not None:
@@ -197,7 +197,7 @@ class Engine:
         return outcome, {**after, "joint_targets": self._held_targets(given)}
 
     def _moved(self, given: Given, ended: Mapping[int, FloatArray]) -> Fields:
-        """Fields of bodies that all move on prescribed poses, for some as far as these."""
+        """Fields of bodies that all move on prescribed poses, some only part of the way."""
         control = given.control
         if ended:
             poses = reached_poses(control["body_poses"], ended, len(given.state["positions"]))
@@ -220,7 +220,7 @@ class Engine:
         return after
 
     def _step_in_turn(self, given: Given, check: Check) -> tuple[Outcome, Fields]:
-        """Do what `_step_together` does by a staggered coupling."""
+        """Compute a step like `_step_together`, by a staggered coupling."""
         assert self._staggered is not None
         inputs = self.core_inputs(given, None)
         outcome, after = self._staggered.step(given, inputs, check)
@@ -265,7 +265,7 @@ class Engine:
         )
 
     def totals(self, state: Fields, parameters: Fields) -> Totals:
-        """Momentum and energy of everything that has mass."""
+        """Momentum and energy of all objects with mass."""
         totals = cloth_totals(self.assembly, state, parameters)
         if self.dynamics is not None:
             totals = totals.plus(self.dynamics.totals(state, parameters))

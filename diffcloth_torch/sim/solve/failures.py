@@ -1,4 +1,4 @@
-"""Environments in which a step failed: their states have no gradient, and backward says so."""
+"""Environments in which a step failed: their states have no gradient; backward raises an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from diffcloth_torch.sim.solve.step import CONVERGED, INFEASIBLE, TURNED, UNCONV
 __all__ = ["failures_of", "mark", "refuse_gradients"]
 
 Failures = dict[int, type[SimulationError]]
-"""Environments whose step failed -> the error that says so."""
+"""Environments whose step failed -> the error to raise."""
 
 _ERRORS = {UNCONVERGED: NotConverged, INFEASIBLE: InfeasibleMotion, TURNED: TurnedTooFar}
 _REMEDIES: dict[type[SimulationError], str] = {
@@ -47,7 +47,7 @@ def failures_of(diagnostics: dict[str, Any]) -> Failures:
 
 
 def refuse_gradients(fields: Fields, failures: Failures) -> Fields:
-    """The same fields [B, ...]; a derivative that depends on a failed environment raises."""
+    """Return the same fields [B, ...]; a derivative that depends on a failed environment raises."""
     if not failures:
         return fields
     return {
@@ -57,7 +57,7 @@ def refuse_gradients(fields: Fields, failures: Failures) -> Fields:
 
 
 class _Guard(torch.autograd.Function):
-    """The identity; it checks the cotangents of backward, and tangents."""
+    """The identity; checks the cotangents of backward, and tangents."""
 
     @staticmethod
     def forward(tensor, failures):

@@ -15,7 +15,7 @@ __all__ = ["cloth_totals", "vertex_masses"]
 
 
 def vertex_masses(assembly: Assembly, parameters: Fields) -> Tensor:
-    """Mass of each vertex, a third of that of each face around it, [B or 1, N] kg."""
+    """Mass of each vertex, a third of the mass of each adjacent face, [B or 1, N] kg."""
     if not assembly.cloth_count:
         return cpu.zeros(1, 0)
     density, rest = parameters["density"], parameters["rest_positions"]

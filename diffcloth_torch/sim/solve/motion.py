@@ -31,10 +31,10 @@ def reached_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments
 
 
 def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fields:
-    """Fields [B or 1, ...] with the rows of some environments replaced by those of `others`.
+    """Return fields [B or 1, ...] with the rows of some environments taken from `others`.
 
-    The others must have no graph: all other rows then keep the same gradients, to the bit, as
-    without a replacement.
+    `others` must have no graph: all other rows then keep the same gradients, to the bit, as without
+    a replacement.
     """
     mixed = {}
     for name, other in others.items():
@@ -50,7 +50,7 @@ def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float)
     Velocities are left out if nothing moves: a state then has zeros.
 
     Args:
-        layout: What the rows stand for.
+        layout: Meaning of the rows.
         state: Fields of the state before the step.
         control: Completed fields of the control.
         dt: Time step [s].

@@ -34,7 +34,7 @@ __all__ = ["make_report", "raise_on_failure"]
 
 
 def _named(prefix: str) -> dict[str, str]:
-    """Name in a report -> full name, of the core's numbers with a prefix."""
+    """Name in a report -> full name, for the core's numbers with a prefix."""
     return {n.removeprefix(prefix): n for n in DIAGNOSTICS if n.startswith(prefix)}
 
 
@@ -48,7 +48,7 @@ _NAMES = {
 }
 _SECONDS = _named("seconds_")
 _COUNTS = _named("count_")
-# Fields of a report that are numbers of the core, of each type with the entries of its tables.
+# Fields of a report that are numbers of the core, by type, with the entries of its tables.
 _INTEGERS = ("iterations", "contact_count")
 _REALS = ("residual", "minimum_distance", "motion_fraction", "cpu_seconds")
 _ROWS: dict[type, tuple[str, ...]] = {
@@ -59,7 +59,7 @@ _REPORTED = tuple(name for names in _ROWS.values() for name in names)
 
 
 def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
-    """Put the core's numbers into a report, with the names of the surfaces."""
+    """Make a report of the core's numbers, with the names of the surfaces."""
     names = tuple(_NAMES[status] for status in diagnostics["status"])
     criteria = tuple(CRITERIA[criterion] for criterion in diagnostics["criterion"])
     converged: list[bool] = [status == CONVERGED for status in diagnostics["status"]]
@@ -82,7 +82,7 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
 
 
 def _tensors(diagnostics: dict[str, Any]) -> dict[str, Tensor]:
-    """The reported numbers of a batch, [B] each: those of one type are rows of one array."""
+    """The reported numbers of a batch, [B] each: numbers of one type are rows of one array."""
     rows: dict[str, Tensor] = {}
     for kind, names in _ROWS.items():
         table = torch.from_numpy(np.array([diagnostics[n] for n in names], dtype=kind))
@@ -93,7 +93,7 @@ def _tensors(diagnostics: dict[str, Any]) -> dict[str, Tensor]:
 def raise_on_failure(
     diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
 ) -> None:
-    """Raise the worst failure of any environment; without `throw` only one that leaves no state."""
+    """Raise the worst failure of any environment; without `throw` only one without a state."""
     status = np.array(diagnostics["status"])
     failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
         (
@@ -134,6 +134,6 @@ def raise_on_failure(
 
 
 def _share(fraction: float) -> str:
-    """Three digits; what is less than one does not read as one."""
+    """Three digits; a fraction below one is not rounded to one."""
     left = 1.0 - fraction
     return f"1 - {left:.1g}" if 0.0 < left < 1e-3 else f"{fraction:.3g}"

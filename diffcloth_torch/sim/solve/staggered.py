@@ -1,4 +1,4 @@
-"""The staggered couplings of a scene: the solves, whose order is in `dynamics.staggering`."""
+"""The solves of a scene's staggered couplings; `dynamics.staggering` has their order."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from diffcloth_torch.sim.solve.step import (
 __all__ = ["Staggered"]
 
 Check = Callable[[dict[str, Any]], None]
-"""Raises where the diagnostics of a solve say that it failed."""
+"""Raises an error if the diagnostics of a solve show a failure."""
 
 # Fields of a state besides velocities, forces and efforts.
 _PLACES = ("positions", "body_poses", "joint_positions", "base_poses")
@@ -69,15 +69,14 @@ class _Solved(NamedTuple):
 
 
 class Staggered:
-    """Steps a scene by "rigid_to_cloth" or "cloth_to_rigid".
+    """Computes steps by "rigid_to_cloth" or "cloth_to_rigid".
 
     Attributes:
         layout: Meaning of the rows.
         dynamics: Dynamics of the bodies and robots.
         rigid: Core of bodies and robots, without the cloths.
         cloth: Core of the cloths, with all coordinates prescribed.
-        judge: Core in which nothing moves by itself; it tells whether a motion is free of
-            collisions.
+        judge: Core in which nothing moves by itself; it detects collisions of a motion.
     """
 
     def __init__(
@@ -106,13 +105,13 @@ class Staggered:
         alone = coupled._replace(bending_models=())
         self.rigid = make_core(without_cloths(assembly), alone, limit_stiffness)
         self.cloth = make_core(assembly, options, limit_stiffness, all_prescribed=True)
-        # Nothing moves by itself there: a step succeeds if the motion is free of collisions.
+        # Nothing moves by itself: a step succeeds if the motion is free of collisions.
         pinned = with_all_pinned(assembly)
         self.judge = make_core(pinned, coupled, limit_stiffness, all_prescribed=True)
         self._watch = AddedMassWatch(coupling, layout, surfaces, dynamics, (self.cloth, self.rigid))
 
     def step(self, given: Given, inputs: Fields, check: Check) -> tuple[Outcome, Fields]:
-        """Take a step; the outcome and the fields after it have a leading axis of environments.
+        """Compute a step; outcome and fields after it have a leading axis of environments.
 
         Args:
             given: Checked state, control and parameters.
@@ -186,10 +185,10 @@ class Staggered:
         }
 
     def blocked_ways(self, inputs: dict[str, FloatArray], known: Container[int]) -> dict[int, str]:
-        """Find motions of bodies and robots into cloths at rest; raise for them with `throw`.
+        """Find motions of bodies and robots into cloths at rest; with `throw`, raise for them.
 
         Returns:
-            Environments with such a motion, except the known ones, and what to do about it.
+            Environments with such a motion, except the known ones -> a message with a remedy.
         """
         result = self.judge.forward(inputs, False, torch.get_num_threads())
         diagnostics = diagnostics_of(result)
@@ -210,11 +209,11 @@ class Staggered:
 
 
 class _Solves:
-    """The solves of one step, in the order in which a coupling asks for them.
+    """The solves of one step, called by a coupling in its order.
 
     Attributes:
         paths: Polylines of the surfaces solved with the cloths.
-        blocked: Environments whose motion cannot be completed -> why.
+        blocked: Environments whose motion cannot be completed -> the reason.
     """
 
     def __init__(
@@ -250,7 +249,7 @@ class _Solves:
             given["friction_origins"] = origins
         outcome = take_step(self._owner.cloth, given)
         self._look_at(outcome)
-        if self.blocked:  # squeezed cloth may push too hard to find a motion
+        if self.blocked:  # the forces of squeezed cloth may be too large to find a motion
             forces = {"": outcome.body_forces}
             none = {"": torch.zeros_like(outcome.body_forces)}
             outcome = outcome._replace(body_forces=with_rows(forces, none, self.blocked)[""])
@@ -277,17 +276,17 @@ class _Solves:
 
 
 def _merged(cloth: dict[str, Any], rigid: dict[str, Any], cloth_count: int) -> dict[str, Any]:
-    """Merge the diagnostics of the two solves of a step; entries not listed here are added up.
+    """Merge the diagnostics of the two solves of a step; entries not listed here are summed.
 
     Args:
         cloth: Diagnostics of the cloths' solve.
-        rigid: Diagnostics of the solve of bodies and robots, which numbers surfaces without the
-            cloths.
+        rigid: Diagnostics of the solve of bodies and robots, where surfaces are numbered without
+            the cloths.
         cloth_count: Number of cloths.
     """
     combine = {
         "status": np.maximum,
-        "criterion": np.maximum,  # in which failures follow convergence
+        "criterion": np.maximum,  # failures follow convergence in the order of criteria
         "certified": np.minimum,
         "residual": np.maximum,
         "minimum_distance": np.minimum,
@@ -324,7 +323,7 @@ def _blocked(diagnostics: dict[str, Any]) -> dict[int, str]:
 def _at_start(state: Fields, tensors: Fields) -> Fields:
     """Fields after a step that did not take place: nothing has moved.
 
-    The start is the only configuration that the successive solves of bodies and cloths share.
+    The start is the only configuration common to the successive solves of bodies and cloths.
     """
     return {
         name: state[name].detach() if name in _PLACES and name in state else torch.zeros_like(old)

@@ -5,7 +5,7 @@ minimizer the gradient vanishes, and so does its derivative along u:
 
     g(x, u) = dP/dx = 0,    H dx + (dg/du) du = 0,    H = dg/dx.
 
-With the cotangent x_bar of everything that depends on x, the gradient of the loss is
+With the cotangent x_bar of x and all its functions, the gradient of the loss is
 
     H lambda = x_bar,    u_bar = -(dg/du)^T lambda + (explicit dependence of the outputs on u),
 
@@ -64,7 +64,7 @@ CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
 TURNED = 4  # not from the core: bodies turn further than a step resolves
 
 DIAGNOSTICS = tuple(_core.number_names)
-"""Names of the numbers that the core has for each environment; some open with what they are."""
+"""Names of the core's numbers for each environment; some have a prefix for their kind."""
 
 CRITERIA = tuple(_core.criteria)
 """Texts of a report for the core's number "criterion"."""
@@ -110,7 +110,7 @@ class Outcome(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """An input that nobody outside can edit, and that needs no gradient.
+    """An input that cannot be edited from outside, and that needs no gradient.
 
     Attributes:
         tensor: The tensor that identifies it.
@@ -131,7 +131,7 @@ def take_step(
     inputs: dict[str, Tensor],
     constants: Mapping[str, Constant] = _NO_CONSTANTS,
 ) -> Outcome:
-    """Take one step; keep a tape only if a gradient may be asked for.
+    """Compute one step; keep a tape only if a gradient may be requested.
 
     Args:
         core: The simulator in C++.
@@ -141,7 +141,7 @@ def take_step(
     """
     known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
     given = {name: tensor for name, tensor in inputs.items() if name not in known}
-    # Decided here, because inside Function.forward gradients are always off.
+    # Checked here, because inside Function.forward gradients are always off.
     if not is_differentiated(given.values()):
         arrays = known | {name: as_array(t) for name, t in given.items()}
         result = _forward(core, arrays, tape=False)
@@ -174,7 +174,7 @@ def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Step(CoreFunction):
-    """A step; the core frees the factors and contacts that it keeps together with the graph."""
+    """A step; the core frees its kept factors and contacts together with the graph."""
 
     owner = "step"
 
@@ -222,5 +222,5 @@ class _Step(CoreFunction):
 
 
 def _depends(direction: NDArray[np.float64], environment: int) -> bool:
-    """Whether directions [K, B or 1, ...] change an input of an environment."""
+    """Return whether directions [K, B or 1, ...] change an input of an environment."""
     return bool(direction[:, min(environment, direction.shape[1] - 1)].any())

@@ -23,7 +23,7 @@ def tree_arguments(
     Args:
         assembly: Arrays of the scene.
         limit_stiffness: Stiffness of the barriers at the limits of coordinates.
-        all_prescribed: Whether the values of all coordinates at the end of a step are given.
+        all_prescribed: True if the values of all coordinates at the end of a step are given.
     """
     links: dict[str, list[Any]] = {
         name: []
@@ -41,7 +41,7 @@ def tree_arguments(
     prescribed: list[bool] = []
     lower: list[float] = []
     upper: list[float] = []
-    place: dict[tuple[int, int], int] = {}  # of a mechanism's link in the list of all links
+    place: dict[tuple[int, int], int] = {}  # index of a mechanism's link in the list of all links
     for t, mechanism in enumerate(assembly.mechanisms):
         if mechanism.base == "floating":
             prescribed += [False] * _ROOT

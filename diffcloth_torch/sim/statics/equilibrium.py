@@ -7,10 +7,11 @@ A step of length H from rest minimizes
 with the weight and all other forces f, elasticity W, the barrier B and friction D. As H grows, the
 first term vanishes: the steps descend to a stable minimum of the other terms (pseudo-transient
 continuation), and the last one is Newton's method without inertia, certified like every step. In
-all steps friction counts motion from the state x_0 where the search begins, so that contacts that
-stick there keep sticking. Friction uses the normal forces of the previous solution, and the weight
-of robots their configuration there: the last step is repeated until these no longer change. The
-equilibrium is a fixed point of that step, and has its derivative (`fixed_point`).
+all steps friction measures motion from the initial state x_0 of the search, so that sticking
+contacts keep sticking. Friction uses the normal forces of the previous solution, and the weight of
+robots their previous configuration: the last step is repeated until these no longer change. The
+equilibrium is a fixed point of the last step, and has the derivative of this fixed point
+(`fixed_point`).
 
 References:
     Kelley and Keyes, "Convergence analysis of pseudo-transient continuation", SIAM Journal on
@@ -54,24 +55,24 @@ Diagnostics = dict[str, Any]
 Anchor = tuple[Tensor, Tensor | None]
 
 # Lengths of the steps, in time steps of the simulator. In the last one inertia is below rounding
-# compared to any stiffness. Modes without stiffness are found in the one before, where inertia
-# still exceeds the stiffness that a residual force gives to a free mode: of 49 sheets that turn
-# about one vertex, probes at 1e5 steps missed 12, probes at 3e3 steps none. A mode that is held but
-# takes more than some 2e4 steps to swing counts as free.
+# compared to any stiffness. Modes without stiffness are detected in the one before, where inertia
+# still exceeds the stiffness that a residual force adds to a free mode: of 49 sheets that turn
+# about one vertex, probes at 1e5 steps missed 12, probes at 3e3 steps none. A held mode with a
+# period of more than some 2e4 steps counts as free.
 _GROWTH = (1e1, 1e2, 1e3)
 _PROBED = 3e3
 _LAST = 1e8
 
-# Fields of a state that an equilibrium finds.
+# Fields of a state that an equilibrium determines.
 _MOVING = ("positions", "body_poses", "joint_positions", "base_poses")
 
-# Robots settle in steps that count their weight with an upper bound of its stiffness, until nothing
-# moves by more than this share of the scene; then in those with the stiffness itself.
+# Robots settle in steps that use an upper bound for the stiffness of their weight, until nothing
+# moves by more than this share of the scene; then in steps with the stiffness itself.
 _NEAR = 1e-3
 _DESCENTS = 300
 
-# Friction iterations of the last step, so that normal forces settle within it, and how often that
-# step is repeated at most.
+# Friction iterations of the last step, so that normal forces settle within it, and the largest
+# number of its repetitions.
 _FRICTION_ITERATIONS = 8
 _REPEATS = 12
 
@@ -91,12 +92,12 @@ class _Found(NamedTuple):
 
 
 class _Settled(NamedTuple):
-    """A state at which another last step changes nothing.
+    """A state that a further last step does not change.
 
     Attributes:
         here: The state.
         unsettled: Environments in which friction has not settled.
-        touching: In which environments something is in contact, [B].
+        touching: Environments with contacts, [B].
     """
 
     here: Given
@@ -117,7 +118,7 @@ class Equilibria:
         contact: ContactOptions,
         solver: SolverOptions,
     ) -> None:
-        """Keep the arguments of the engines: those of `Simulator`, checked."""
+        """Keep the arguments of the engines: the checked arguments of `Simulator`."""
         self._scene, self._layout, self._dt, self._scheme = scene, layout, dt, scheme
         self._contact, self._solver = contact, solver
         self._engines: dict[float, Engine] = {}
@@ -125,7 +126,7 @@ class Equilibria:
         self._settles = any(robot.is_dynamic for robot in assembly.robots)
         points = assembly.vertices if len(assembly.vertices) else assembly.body_vertices
         size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
-        # Without any extent, as for a wheel alone, a radian counts like a meter.
+        # Without any extent, as for a single wheel, a radian counts like a meter.
         self._size = max([size, *(_reach(robot) for robot in assembly.robots)]) or 1.0
         turns = [turn for robot in assembly.robots for turn in _turns(robot)]
         # A radian counts like the size of the scene.
@@ -162,11 +163,11 @@ class Equilibria:
             counted: Tensor | None = None,
         ) -> _Found:
             given = _slower(at, length)
-            # A step on the way need not converge: the next one goes on from its end.
+            # An intermediate step may fail to converge: the next one continues from its end.
             checked = _unless_unconverged(check) if length in _GROWTH else check
             try:
                 found = _Found(*self._engine(length).step(given, checked, anchor, turned))
-            except TurnedTooFar as error:  # its time step is that of the search
+            except TurnedTooFar as error:  # its message names a time step of the search
                 raise TurnedTooFar(
                     "equilibrium: a body turns further on the way to rest than a step resolves; "
                     "begin nearer to rest, as at the end of a rollout",
@@ -231,7 +232,7 @@ class Equilibria:
                 ),
                 weight="bounded" if length in _GROWTH else "exact",
                 limits_dt=self._dt,
-                begins_at_state=True,  # inertia alone leads millions of meters away
+                begins_at_state=True,  # inertia alone would move it millions of meters away
             )
         return self._engines[length]
 
@@ -262,9 +263,9 @@ class Equilibria:
             )
 
     def _begun(self, given: Given, state: Fields) -> Given:
-        """The given inputs, at a state that was found; what its robots hold keeps its graph.
+        """Return the inputs at a computed state; prescribed joints and bases keep their graph.
 
-        That is where the control has it, as the weight of robots is that of the start of a step.
+        They begin at their targets, as the weight of robots is evaluated at the start of a step.
         """
         permissions = self._layout.permissions
         kept = {n: t for n, t in given.state.items() if n == "joint_targets"}
@@ -285,9 +286,9 @@ class Equilibria:
         step: Callable[[Given, Anchor], Fields],
         anchor: Anchor,
     ) -> Given:
-        """The start of the last step, with the derivative of a start that is also its end."""
+        """Return the start of the last step, with the derivative of its equal end."""
         begun = self._begun(given, here.state)
-        if not touching.any():  # nothing else that a step has at its start matters at its end
+        if not touching.any():  # the end depends on the start through contact alone
             return begun
         still = {n: here.state[n] for n in _MOVING if n in here.state}
         numbers = _plain(given)
@@ -307,9 +308,9 @@ class Equilibria:
         return begun
 
     def _efforts(self, begun: Given, fields: Fields) -> Tensor:
-        """Efforts of the last step, those of prescribed joints with the weight of its end.
+        """Return the efforts of the last step, for prescribed joints with the weight at its end.
 
-        The step has the weight of its start, which is the same but has no graph where joints and
+        The step uses the weight at its start. It has the same value, but no graph if joints and
         bases are free.
         """
         dynamics = self._engine(_LAST).dynamics
@@ -323,7 +324,7 @@ class Equilibria:
         return fields["joint_efforts"] + torch.where(held, change, 0.0)
 
     def _descend(self, here: Given, step: Callable[[Given, Tensor], _Found]) -> Given:
-        """Repeat a step until robots are near an equilibrium, in each environment by itself."""
+        """Repeat a step until robots are near an equilibrium, independently in each environment."""
         far = cpu.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_DESCENTS):
             after = _only(far, self._from(here, step(here, far)), here)
@@ -334,7 +335,7 @@ class Equilibria:
         return here
 
     def _moved(self, before: Fields, after: Fields) -> Tensor:
-        """How far vertices and joints have moved [m], [B, N + V + J]."""
+        """Return the displacements of vertices and joints [m], [B, N + V + J]."""
         surfaces = self._engine(_LAST).surfaces
         moved: Tensor = (surfaces.vertices(after) - surfaces.vertices(before)).norm(dim=-1)
         if "joint_positions" not in after:
@@ -361,7 +362,7 @@ class Equilibria:
     def _settle(self, here: Given, step: Callable[[Given, Tensor], _Found]) -> _Settled:
         """Repeat the last step until friction has settled, a limited number of times.
 
-        In each environment by itself: what others are like, and whether they fail, is no matter.
+        Environments are independent: neither values nor failures of one affect another.
         """
         slip = here.parameters.get("slip_velocity")
         enough = cpu.tensor([self._dt * self._solver.tolerance])
@@ -381,7 +382,7 @@ class Equilibria:
         return _Settled(here, moves.nonzero()[:, 0].tolist(), touching & ~failed)
 
     def _probe(self, here: Given, step: Callable[[Given], _Found]) -> Given:
-        """Take a step, and refuse things that a push moves without end: the Hessian is singular."""
+        """Compute a step; refuse things that a push moves without bound: a singular Hessian."""
         names = ["velocities", "body_velocities"]
         if self._settles:
             names += ["joint_velocities", "base_velocities"]
@@ -401,7 +402,7 @@ class Equilibria:
 
 
 def _unless_unconverged(check: Check) -> Check:
-    """The check of all failures but that of a solve that has not reached its tolerance."""
+    """Check all failures except a solve that has not reached its tolerance."""
 
     def checked(diagnostics: Diagnostics) -> None:
         if any(status not in (CONVERGED, UNCONVERGED) for status in diagnostics["status"]):
@@ -411,7 +412,7 @@ def _unless_unconverged(check: Check) -> Check:
 
 
 def _only(mask: Tensor, after: Given, before: Given) -> Given:
-    """The state after, in the environments of a mask; the bits of the others stay as they were."""
+    """Return the later state in the environments of a mask; the others keep their bits."""
     state = {
         name: torch.where(mask.reshape(-1, *[1] * (t.dim() - 1)), t, before.state[name])
         for name, t in after.state.items()
@@ -431,20 +432,20 @@ def _leaf(values: Tensor) -> Tensor:
 def _reach(robot: Mechanism) -> float:
     """Upper bound on the distance of links and their centers of mass, without shifts of joints [m].
 
-    A robot whose joints all meet in one point may have its weight beside it.
+    A robot whose joints all meet in one point may have its center of mass outside of it.
     """
     offsets = np.linalg.norm(robot.offset[:, :3, 3], axis=-1).sum()
     return float(offsets + np.linalg.norm(robot.center, axis=-1).max(initial=0.0))
 
 
 def _turns(robot: Mechanism) -> list[bool]:
-    """Whether each of the J joints turns what it carries."""
+    """For each of the J joints, return whether it is rotational."""
     leads = (int(np.flatnonzero(robot.dof == j)[0]) for j in range(robot.joint_count))
     return [bool(robot.turning[link]) for link in leads]
 
 
 def _resting(given: Given) -> Given:
-    """The same inputs at rest, where nothing resists motion."""
+    """The same inputs at rest, without resistance to motion."""
     parameters = given.parameters
     at_rest = {n: PARAMETERS[n].at_rest for n in parameters}
     values = {n: 0.0 * parameters[n] + v for n, v in at_rest.items() if v is not None}

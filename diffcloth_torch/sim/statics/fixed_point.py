@@ -1,12 +1,12 @@
-"""Derivatives of a fixed point x = S(x, p) of a map whose products with vectors are known.
+"""Derivatives of a fixed point x = S(x, p) of a map with known products with vectors.
 
-What S gives at the fixed point has the derivative dS/dp, and the fixed point
+The value of S at the fixed point has the derivative dS/dp, and the fixed point
 
     dx/dp = (1 - dS/dx)^-1 dS/dp = (1 + dS/dx + (dS/dx)^2 + ..) dS/dp.
 
-The series converges as fast as repetitions of S, with which the fixed point was found. Backward
-adds its terms up. Forward repeats S as often as that takes, since torch has products with dS/dx
-only where S is evaluated.
+The series converges as fast as the repetitions of S by which the fixed point was found. Backward
+sums its terms. Forward repeats S as often as necessary, since torch has products with dS/dx only
+when S is evaluated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from diffcloth_torch.errors import SimulationError
 
 __all__ = ["Linearization", "as_fixed_point", "at_values"]
 
-# Terms of the series are added until they are this small beside their sum, at most so many.
+# Terms of the series are added until they are this small relative to their sum; largest number.
 _SMALL = 1e-12
 _TERMS = 500
 
@@ -37,14 +37,14 @@ class Linearization:
     """S near a fixed point, as a function of x alone.
 
     Attributes:
-        acts: In which environments S depends on x, [B]; the others count as if it did not.
+        acts: Environments in which S depends on x, [B]; in others this dependence is ignored.
     """
 
     def __init__(
         self, function: Callable[[Fields], Mapping[str, Tensor]], at: Fields, acts: Tensor
     ) -> None:
-        """Evaluate S at x = `at`, fields [B, ...], where it gives fields of the same names."""
-        # Hooks of a checkpoint around all this are not for this graph. Inside `torch.func.grad`
+        """Evaluate S at x = `at`, fields [B, ...]; the result has fields of the same names."""
+        # Hooks of an enclosing checkpoint are not for this graph. Inside `torch.func.grad`
         # torch has no checkpoints, and refuses hooks.
         hooks: AbstractContextManager[None] = nullcontext()
         if not in_backward_transform():
@@ -77,8 +77,8 @@ class Linearization:
         ]
 
     def terms(self) -> Tensor:
-        """How many powers of dS/dx are not small, in each environment, [B]."""
-        # `torch.vmap` refuses random numbers of torch. All environments have the same ones.
+        """Return the number of powers of dS/dx that are not small, in each environment, [B]."""
+        # `torch.vmap` refuses random numbers of torch. All environments use equal ones.
         generator = np.random.default_rng(0)
         vectors = [
             torch.from_numpy(generator.standard_normal(x.shape[1:])).expand(1, *x.shape)
@@ -95,12 +95,12 @@ class Linearization:
         raise _unsettled(remains)
 
     def masked(self, vectors: Tensor) -> Tensor:
-        """Vectors [k, B, ...] that are zero where nothing acts."""
+        """Vectors [k, B, ...], set to zero in environments without dependence on x."""
         return torch.where(self.acts.reshape(-1, *[1] * (vectors.ndim - 2)), vectors, 0.0)
 
 
 def as_fixed_point(found: Fields, linearization: Linearization, at: Fields) -> Fields:
-    """The fixed point `at`, with the derivative that follows from that of `found` = S(x, p)."""
+    """Return the fixed point `at`, with its derivative from the derivative of `found` = S(x, p)."""
     return _evaluated(_FixedPoint(tuple(found), at, linearization), found)
 
 
@@ -148,7 +148,7 @@ def _summed(linearization: Linearization, vectors: list[Tensor]) -> list[Tensor]
         if not remains.any():
             return sums
         for total, term in zip(sums, terms, strict=True):
-            # Each vector of each environment by itself, whatever the others are like.
+            # Vectors and environments are independent of each other.
             mask = remains.reshape(*remains.shape, *[1] * (term.ndim - 2))
             term.masked_fill_(~mask, 0.0)
             total += term
@@ -156,7 +156,7 @@ def _summed(linearization: Linearization, vectors: list[Tensor]) -> list[Tensor]
 
 
 def _size(vectors: list[Tensor]) -> Tensor:
-    """Largest number of vectors [k, B, ...] in each environment, [k, B]."""
+    """Largest absolute entry of vectors [k, B, ...] in each environment, [k, B]."""
     sizes = [v.abs().flatten(2) for v in vectors if v[0, 0].numel()]
     return torch.stack([s.amax(dim=2) for s in sizes]).amax(dim=0)
 

@@ -1,7 +1,7 @@
-"""What nothing holds at an equilibrium: modes without stiffness, and their names.
+"""Modes without stiffness at an equilibrium, and their names.
 
 A step of length H from rest moves by dx = A^-1 (M/H) dv for small initial velocities dv, where A is
-the Hessian of the step. A mode without stiffness moves by H dv, as it would without any forces.
+the Hessian of the step. A mode without stiffness moves by H dv, as without any forces.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from diffcloth_torch.sim.inputs.layout import Layout
 
 __all__ = ["refuse_free_modes", "surface_of_vertex"]
 
-# A mode is free if a velocity moves it by this fraction of its way without forces.
+# A mode is free if a velocity moves it by this fraction of its displacement without forces.
 _FREE = 0.5
 _PROBES = 16
 _AXES = "xyz"
@@ -33,7 +33,7 @@ def refuse_free_modes(
         fields: The end of the step.
         pushes: Its initial velocities, by field.
         forces: "joint_efforts" and "base_wrenches" of robots. A velocity of a joint has momentum in
-            all joints; the response to efforts tells which one is free.
+            all joints; the response to efforts identifies the free one.
         length: H [s].
 
     Raises:
@@ -43,7 +43,7 @@ def refuse_free_modes(
     if not outputs:
         return
     generator = cpu.generator().manual_seed(0)
-    # The same in all environments, so that what is refused alone is refused in a batch.
+    # Equal in all environments, so that a batch refuses the same environments as single ones.
     signs = [
         (2.0 * cpu.randint(2, (_PROBES, 1, *t.shape[1:]), generator=generator).double() - 1.0)
         .expand(-1, len(t), *t.shape[1:])
@@ -64,7 +64,7 @@ def refuse_free_modes(
     }
     for field in pushes:
         sizes = responses[field].flatten(2).norm(dim=2)
-        # Some signs see little of a mode, so their mean square tells.
+        # Some signs excite a mode little, so the mean square is used.
         mean = sizes.square().mean(dim=0).sqrt()
         count = responses[field][0, 0].numel() ** 0.5  # a rigid mode spreads its push
         free = mean * count > _FREE * length
@@ -94,7 +94,7 @@ def surface_of_vertex(layout: Layout, vertex: int) -> str:
 
 
 def _sentence(layout: Layout, field: str, mode: Tensor) -> str:
-    """Say what is free, and to do what."""
+    """Describe the free object and its free motion."""
     assembly = layout.assembly
     if field == "joint_efforts":
         name = layout.joint_names[int(mode.abs().argmax())]
