@@ -168,8 +168,9 @@ def hold():
         time.sleep(1e4)
 
 if __name__ == "__main__":
-    # A shell starts what it runs in the background with the interrupt ignored.
+    # Shells ignore the interrupt in background jobs, and nohup ignores SIGHUP; both are inherited.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     note("main")
     import threading
     pool = Pool("pool", 2, 1e4)
