@@ -162,6 +162,7 @@ WITHOUT_REFUSAL = {
     "envs.EnvState.detach",
     "envs.Task.example",
     "fabrics.Measurement",
+    "learn.Episodes",
     "learn.Jobs",
     "learn.Trainer.update",
     "robots.panda",

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -31,29 +30,28 @@ from diffcloth_torch.checkpoint import (
     refusing_damage,
     write_checkpoint,
 )
-from diffcloth_torch.checks import check_count, check_shape, refuse_threads
+from diffcloth_torch.checks import check_count, check_shape
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.adam import TensorAdam
+from diffcloth_torch.learn.evaluation import steps_of
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.policy import TRAINER, Policy, file_to_write
 from diffcloth_torch.learn.rollouts import (
     MakeEnv,
     Piece,
-    Policy,
     Rollout,
     roll_out,
     roll_out_remotely,
     threads_of_torch,
 )
-from diffcloth_torch.learn.workers import Ranks, Workers
+from diffcloth_torch.learn.workers import Ranks, Workers, check_workers, pickled
 from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Trainer", "record_of", "restore"]
-
-_CHECKPOINT = "trainer"  # kind of its files
 
 
 class Trainer:
@@ -108,28 +106,18 @@ class Trainer:
         check_count("Trainer: `num_envs`", num_envs, 1)
         if num_envs % self._chunk:
             raise InvalidInput(f"Trainer: `chunk` must divide {num_envs}, got {chunk}")
-        refuse_threads("Trainer: `workers`", workers)
-        if workers is not None and (
-            isinstance(workers, type) or not callable(getattr(workers, "map", None))
-        ):
-            raise TypeError(
-                "Trainer: `workers` must have `map`, as dc.learn.Processes(2) and executors do, "
-                f"got {workers!r}"
-            )
+        check_workers("Trainer: `workers`", workers)
         self._make_env, self._workers = make_env, workers
         self._threads = check_count("Trainer: `threads`", threads, 1)
-        self._pickled = b"" if workers is None else _pickled(make_env)
+        self._pickled = (
+            b"" if workers is None else pickled("Trainer: with `workers`, `make_env`", make_env)
+        )
         self._env = begins_anew("Trainer: `make_env`", make_env(num_envs=self._chunk))
         self._count = num_envs
         each = self._env.task.example().state.nbytes
         check_memory("Trainer: `num_envs`", num_envs, each, "a state")
         horizon = self.options.horizon
         check_memory("TrainerOptions: `horizon`", horizon, self._chunk * each, "a step")
-        actions, first = self.task.action_size, self.options.first_action
-        if first is not None and len(first) != actions:
-            raise InvalidInput(
-                f"TrainerOptions: `first_action` must have {actions} numbers, got {len(first)}"
-            )
         o = self.options
         self._noise = cpu.generator().manual_seed(o.seed)
         with torch.random.fork_rng(devices=[]):
@@ -226,19 +214,14 @@ class Trainer:
         each = self.task.horizon * self.task.example().state.nbytes
         check_memory("Trainer.evaluate: `episodes`", episodes, each, "an episode")
         env = self._make_env(num_envs=episodes)
-        observation, _ = env.reset(seed=seed)
-        total, running = (
-            cpu.zeros(episodes, dtype=torch.float32),
-            cpu.ones(episodes, dtype=torch.bool),
-        )
+        total = cpu.zeros(episodes, dtype=torch.float32)
         success = cpu.zeros(episodes, dtype=torch.bool)
+        observation, _ = env.reset(seed=seed)
         states = [env.env_state.state]
-        while bool(running.any()):
-            observation, reward, terminated, truncated, info = env.step(self.act(observation))
-            total += torch.where(running, reward, 0.0)
-            success = torch.where(running, info.get("final_info", info)["success"], success)
-            running = running & ~(terminated | truncated)
-            if bool(running.all()):
+        for step in steps_of(env, self.act, observation):
+            total += torch.where(step.running, step.reward, 0.0)
+            success = torch.where(step.running, step.flags["success"], success)
+            if bool(step.goes_on.all()):
                 states.append(env.env_state.state)
         return float(total.mean()), float(success.float().mean()), states
 
@@ -325,10 +308,7 @@ class Trainer:
             InvalidInput: If its folder does not exist.
             OSError: If it cannot be written; an older file stays as it is.
         """
-        path = as_path("Trainer.save: `path`", path)
-        if not path.parent.is_dir():
-            raise InvalidInput(f"Trainer.save: the folder of `path` must exist, got {str(path)!r}")
-        write_checkpoint(path, _CHECKPOINT, self._record())
+        write_checkpoint(file_to_write("Trainer.save", path), TRAINER, self._record())
 
     def load(self, path: str | Path) -> None:
         """Go on with the content of a file of `save`, to the same bits.
@@ -340,7 +320,7 @@ class Trainer:
         path = as_path("Trainer.load: `path`", path)
         if not path.is_file():
             raise InvalidInput(f"Trainer.load: `path` must be a file, got {str(path)!r}")
-        kept = read_checkpoint("Trainer.load", path, _CHECKPOINT)
+        kept = read_checkpoint("Trainer.load", path, TRAINER)
         with refusing_damage("Trainer.load", path):
             self._load("the trainer", kept)
 
@@ -530,13 +510,3 @@ def _lambda_returns(
         time_dim=0,
     )
     return result[..., 0]
-
-
-def _pickled(make_env: MakeEnv) -> bytes:
-    try:
-        return pickle.dumps(make_env)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise InvalidInput(
-            "Trainer: with `workers`, `make_env` must be a function of a module, or such as "
-            f"functools.partial(dc.envs.make, 'FoldCloth'), that can be pickled: {error}"
-        ) from error

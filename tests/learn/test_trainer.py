@@ -24,7 +24,7 @@ from diffcloth_torch.learn import rollouts as rollouts_module
 from diffcloth_torch.learn import trainer as trainer_module
 from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.networks import Actor, Plan
-from diffcloth_torch.learn.rollouts import Policy
+from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
 
 HOLD = (0.0, 0.0, 0.1, 0.9, 0.0, 0.0, 0.1, 0.9)
