@@ -514,6 +514,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "learn.Processes": lambda w: call(dc.learn.Processes, 1),
     "learn.Trainer": lambda w: call(dc.learn.Trainer, w.make_env, num_envs=2),
     "learn.Trainer.act": lambda w: call(w.kept[0].act, w.observation),
+    "learn.Trainer.check": lambda w: call(w.kept[0].check),
     "learn.Trainer.evaluate": lambda w: call(w.kept[0].evaluate, 2, 1),
     "learn.Trainer.load": lambda w: call(w.kept[0].load, w.kept[1]),
     "learn.Trainer.save": lambda w: call(w.kept[0].save, w.folder / "again.pt"),

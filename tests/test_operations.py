@@ -164,6 +164,7 @@ WITHOUT_REFUSAL = {
     "fabrics.Measurement",
     "learn.Episodes",
     "learn.Jobs",
+    "learn.Trainer.check",
     "learn.Trainer.update",
     "robots.panda",
 }

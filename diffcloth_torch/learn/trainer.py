@@ -36,9 +36,15 @@ from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.adam import TensorAdam
-from diffcloth_torch.learn.evaluation import steps_of
+from diffcloth_torch.learn.evaluation import (
+    episode_seeds,
+    evaluate_starts,
+    purpose_seed,
+    steps_of,
+)
+from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
 from diffcloth_torch.learn.options import TrainerOptions
-from diffcloth_torch.learn.policy import TRAINER, Policy, file_to_write
+from diffcloth_torch.learn.policy import TRAINER, Policy, begin_at, file_to_write
 from diffcloth_torch.learn.rollouts import (
     MakeEnv,
     Piece,
@@ -62,9 +68,11 @@ class Trainer:
 
     Attributes:
         policy: The policy and its critic.
-        options: As given.
-        steps: Environment steps so far.
+        options: As given, or those of fine-tuning where `init` is given.
+        steps: Environment steps of rollouts so far.
         updates: Of the policy so far.
+        held_out: Seeds of the starts at which the policy is checked; see `TrainerOptions`.
+        undone: How often a check has restored an earlier policy.
     """
 
     def __init__(
@@ -76,28 +84,39 @@ class Trainer:
         chunk: int | None = None,
         workers: Workers | None = None,
         threads: int = 1,
+        init: Policy | None = None,
     ) -> None:
         """Make the networks, and begin episodes.
 
         Args:
             make_env: Makes environments that begin anew in the step in which they end:
                 `functools.partial(dc.envs.make, "FoldCloth", size=12)`.
-            options: How to learn.
+            options: How to learn; None for those of `init`, or else the defaults.
             num_envs: Number of environments in a rollout.
             chunk: Number of them that step together; all by default. It must divide `num_envs`.
             workers: What makes the rollouts of chunks; None makes them here.
             threads: Of torch in an update, here and in each worker. Results depend on it in the
                 last bits.
+            init: A policy at whose weights training begins, of the same observations and actions,
+                hidden layers and number of knots. Its algorithm, task, horizon and rates may be
+                others. Then updates are bounded and checked by default: see `max_change` and
+                `held_out` of `TrainerOptions`.
 
         Raises:
             InvalidInput: If an argument is not accepted.
         """
-        self.options = TrainerOptions() if options is None else options
+        if init is not None and not isinstance(init, Policy):
+            raise TypeError(f"Trainer: `init` must be a Policy, got {type(init).__name__}")
+        if options is None:
+            options = TrainerOptions() if init is None else init.options
+        self.options = options
         given: object = self.options
         if not isinstance(given, TrainerOptions):
             raise TypeError(
                 f"Trainer: `options` must be TrainerOptions, got {type(given).__name__}"
             )
+        if init is not None:
+            self.options = for_fine_tuning(options)
         if not callable(make_env):
             raise TypeError(
                 f"Trainer: `make_env` must be a function that makes environments, got {make_env!r}"
@@ -123,6 +142,8 @@ class Trainer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(o.seed)
             self.policy = Policy(self._env, o)
+        if init is not None:
+            begin_at("Trainer: `init`", self.policy, init)
         self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
         plan = self.policy.actor.plan
         knots = [] if plan is None else [plan.knots]
@@ -137,7 +158,10 @@ class Trainer:
         self._temperature_steps = torch.optim.Adam(
             [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
         )
-        self.steps = self.updates = 0
+        self.steps = self.updates = self.undone = 0
+        starts = episode_seeds(purpose_seed(o.seed, "undo"), o.held_out or 0)
+        self.held_out: tuple[int, ...] = tuple(starts)
+        self._kept: Kept | None = None
         self._return = cpu.zeros(num_envs, dtype=torch.float32)
 
     @property
@@ -165,7 +189,9 @@ class Trainer:
             What to log: "loss", "gradient_norm" before it is limited, "reward" (the mean of the
             rollout), "failed" (share of steps), "entropy" (of the policy, per number of an action),
             "critic_loss", "temperature" and, where episodes ended, their mean "return" and share of
-            "success".
+            "success". With `max_change` also "change", of actions by the update, and "step_share",
+            the share of the update that was made; after a check "held_out", the share of successes,
+            and "undone", 1 where an earlier policy was restored.
 
         Raises:
             SimulationError: If a gradient is not finite.
@@ -179,11 +205,17 @@ class Trainer:
         for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
             group["lr"] = share * rate
         self._critic_steps.param_groups[0]["lr"] = share * o.critic_rate
+        if self.held_out and self._kept is None:
+            self.check()
         rollouts = self._rollouts()
+        rows = _Rows(rollouts)
         log = {"loss": sum(r.loss for r in rollouts)}
         learns = not self.options.has_critic or self.updates >= self.options.critic_only
+        seen = rows.seen.flatten(0, 1)
+        region = None if o.max_change is None else TrustRegion(self.policy, seen, o.max_change)
         log["gradient_norm"] = self._step_actor(rollouts, learns)
-        rows = _Rows(rollouts)
+        if region is not None:
+            log["change"], log["step_share"] = region.limit()
         log["reward"] = float(rows.rewards.mean())
         log["failed"] = float(rows.failed.float().mean())
         log["entropy"] = float(rows.entropies.mean()) / self.task.action_size
@@ -192,11 +224,41 @@ class Trainer:
         if self.options.has_entropy:
             log["temperature"] = self.policy.temperature
             self._step_temperature(log["entropy"])
-        self.policy.scale.see(rows.seen.flatten(0, 1))
+        if region is None or not float(self.policy.scale.count):
+            self.policy.scale.see(seen)
         self._places = [(r.end, r.generators) for r in rollouts]
         self.steps += rows.rewards.numel()
         self.updates += 1
-        return log | self._ended(rows)
+        log |= self._ended(rows)
+        if self.held_out and self.updates % o.check_every == 0:
+            log |= self.check()
+        return log
+
+    def check(self) -> dict[str, float]:
+        """Follow the policy from the held-out starts, and restore the last good one if it is worse.
+
+        `update` does so after every `check_every` updates. At the end of a fine-tuning, this makes
+        sure that its policy succeeds there as often as the one that it began at.
+
+        Returns:
+            "held_out": the share of successes of the policy that was checked; "undone": 1 if an
+            earlier policy, whose share was larger, was restored. Empty without held-out starts.
+        """
+        if not self.held_out:
+            return {}
+        found = evaluate_starts(
+            "Trainer.check", self._make_env, self.policy, self.held_out, workers=self._workers
+        )
+        success, kept = found.success_rate, self._kept
+        undone = kept is not None and success < kept.success
+        if kept is not None and undone:
+            kept.restore(self.policy, self._actor_steps)
+            self.undone += 1
+        else:
+            weights = Kept.weights_of(self.policy)
+            steps = copy.deepcopy(self._actor_steps.state_dict())
+            self._kept = Kept(self.updates, success, weights, steps)
+        return {"held_out": success, "undone": float(undone)}
 
     def evaluate(self, episodes: int = 8, seed: int = 0) -> tuple[float, float, list[State]]:
         """Follow the policy without noise.
@@ -230,6 +292,8 @@ class Trainer:
             "options": asdict(self.options),
             "task": self._described,
             "counts": [self.steps, self.updates],
+            "undone": self.undone,
+            "kept": None if self._kept is None else copy.deepcopy(vars(self._kept)),
             "return": self._return.clone(),
             "noise": self._noise.get_state(),
             "policy": {name: t.clone() for name, t in self.policy.state_dict().items()},
@@ -243,11 +307,15 @@ class Trainer:
     def _load(self, owner: str, given: Any) -> None:
         """Check a record completely, then go on with it."""
         own = self._record()
+        if isinstance(given, Mapping):  # files before there was fine-tuning have neither
+            given = {"undone": 0, "kept": None} | dict(given)
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
         if given["task"] != own["task"]:
             raise InvalidInput(f"{owner} is of {given['task']}, not of {own['task']}")
-        if given["options"] != own["options"]:
+        if not isinstance(given["options"], dict) or (
+            asdict(TrainerOptions()) | given["options"] != own["options"]
+        ):
             raise InvalidInput(f"{owner} was written with other options")
         places = self._checked_places(owner, given["places"])
         check_like(f"{owner}['counts']", given["counts"], own["counts"])
@@ -263,11 +331,19 @@ class Trainer:
         check_like(f"{owner}['optimizers']", [None] * len(given["optimizers"]), [None] * 3)
         for k, optimizer in enumerate(self._optimizers):
             check_optimizer(f"{owner}['optimizers'][{k}]", given["optimizers"][k], optimizer)
+        check_like(f"{owner}['undone']", given["undone"], 0)
+        last_good: Kept | None = None
+        if given["kept"] is not None:
+            name = f"{owner}['kept']"
+            if not self.held_out:
+                raise InvalidInput(f"{name} must be None without held-out starts")
+            last_good = Kept.checked(name, given["kept"], self.policy, self._actor_steps, updates)
         # Everything is checked: from here on nothing may fail.
         self.policy.load_state_dict(given["policy"])
         for optimizer, kept in zip(self._optimizers, given["optimizers"], strict=True):
             optimizer.load_state_dict(kept)
         self.steps, self.updates = steps, updates
+        self.undone, self._kept = given["undone"], copy.deepcopy(last_good)
         self._return = given["return"].clone()
         self._noise.set_state(given["noise"])
         self._places = places
