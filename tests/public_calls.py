@@ -38,6 +38,7 @@ WITHOUT_CALL = {
     "learn.RayActors": "needs a cluster",
     "learn.RayActors.close": "likewise",
     "learn.RayActors.map": "likewise",
+    "learn.record": "needs the extra `data`",
     "learn.Policy.export": "needs the extra `onnx`",
     "learn.Processes.close": "ends processes",
     "learn.Processes.map": "starts processes, which share no defaults with this one",

@@ -42,10 +42,12 @@ class TryoutSection(Section):
 class TrainConfig(Section):
     """Environments, the options of `TrainerOptions`, and how long to learn.
 
-    The policy is evaluated, and kept, at first, after each `evaluate_every` updates and at the end,
-    in `episodes` episodes of their own. With `until_success` training ends before its last update,
-    as soon as that share of them succeeds. With `tryout` the seed of `trainer` is the one with the
-    largest return after the updates there, which count as the first ones.
+    The policy is evaluated at first, after each `evaluate_every` updates and at the end, in
+    `episodes` episodes of their own. At most five of these policies are compared, in
+    `selection_episodes` others, by their success and then by their return; the best is kept, and at
+    the end reported in `report_episodes` fresh ones. With `until_success` training ends before its
+    last update, as soon as that share of `episodes` succeeds. With `tryout` the seed of `trainer`
+    is the one with the largest return after the updates there, which count as the first ones.
     """
 
     task: Literal["train"]
@@ -56,6 +58,8 @@ class TrainConfig(Section):
     updates: Updates = 100
     evaluate_every: Count = 10
     episodes: Count = 8
+    selection_episodes: Count = 16
+    report_episodes: Count = 64
     until_success: Annotated[float, Ge(0), Le(1)] | None = None
     tryout: TryoutSection | None = None
     workers: WorkersSection = WorkersSection()

@@ -7,6 +7,7 @@
 ...     log = trainer.update()
 """
 
+from diffcloth_torch.learn.demonstrations import record
 from diffcloth_torch.learn.evaluation import Episodes, evaluate
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.policy import Policy, PolicySizes, load_policy
@@ -26,4 +27,5 @@ __all__ = [
     "Workers",
     "evaluate",
     "load_policy",
+    "record",
 ]

@@ -25,6 +25,7 @@ from diffcloth_torch.learn.rollouts import MakeEnv, environments, threads_of_tor
 from diffcloth_torch.learn.workers import Workers, check_workers, pickled
 from diffcloth_torch.operations import called
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.records.state import State
 
 __all__ = [
     "PURPOSES",
@@ -35,7 +36,9 @@ __all__ = [
     "episode_seeds",
     "evaluate",
     "evaluate_starts",
+    "follow",
     "purpose_seed",
+    "seeds_of",
     "steps_of",
 ]
 
@@ -141,9 +144,15 @@ def evaluate(
     Raises:
         InvalidInput: If an argument is not accepted, or the actions have another shape.
     """
-    check_count("evaluate: `episodes`", episodes, 1)
-    check_count("evaluate: `seed`", seed, 0, _LARGEST_SEED)
-    return evaluate_starts("evaluate", make, policy, episode_seeds(seed, episodes), workers=workers)
+    seeds = seeds_of("evaluate", seed, episodes)
+    return evaluate_starts("evaluate", make, policy, seeds, workers=workers)
+
+
+def seeds_of(owner: str, seed: int, episodes: int) -> list[int]:
+    """The seeds of the starts of episodes, of checked arguments."""
+    check_count(f"{owner}: `episodes`", episodes, 1)
+    check_count(f"{owner}: `seed`", seed, 0, _LARGEST_SEED)
+    return episode_seeds(seed, episodes)
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:
@@ -166,6 +175,7 @@ def evaluate_starts(
     seeds: Sequence[int],
     *,
     workers: Workers | None = None,
+    note: Note | None = None,
 ) -> Episodes:
     """Follow a policy from starts by their seeds; see `evaluate`.
 
@@ -175,6 +185,8 @@ def evaluate_starts(
         policy: Likewise.
         seeds: Of the starts, one for each episode.
         workers: As for `evaluate`.
+        note: Called with the environments, the seeds and the steps of each chunk; not with
+            `workers`.
     """
     if not callable(make):
         raise TypeError(f"{owner}: `make` must be a function that makes environments, got {make!r}")
@@ -193,7 +205,7 @@ def evaluate_starts(
         for chunk in chunks:
             if len(chunk) not in made:
                 made[len(chunk)] = make(num_envs=len(chunk))
-            found.append(_rows(owner, made[len(chunk)], policy, chunk))
+            found.append(_rows(owner, made[len(chunk)], policy, chunk, note))
     else:
         make_env = pickled(f"{owner}: with `workers`, `make`", make)
         pickled(f"{owner}: with `workers`, `policy`", policy)
@@ -203,6 +215,31 @@ def evaluate_starts(
         steps=sum(int(each["lengths"].sum()) for each in found),
         seeds=tuple(seeds),
     )
+
+
+def follow(
+    env: ClothVectorEnv, act: Callable[[Tensor], Tensor], seed: int | Sequence[int]
+) -> tuple[Tensor, Tensor, list[State]]:
+    """Follow actions from starts, and keep the states.
+
+    Args:
+        env: Environments, which are reset.
+        act: Actions [B, A] for observations [B, O].
+        seed: Of the reset.
+
+    Returns:
+        Returns [B], successes [B], and the states of all episodes until the first of them ends.
+    """
+    observation, _ = env.reset(seed=seed)
+    total = cpu.zeros(env.num_envs, dtype=torch.float32)
+    success = cpu.zeros(env.num_envs, dtype=torch.bool)
+    states = [env.env_state.state]
+    for step in steps_of(env, act, observation):
+        total += torch.where(step.running, step.reward, 0.0)
+        success = torch.where(step.running, step.flags["success"], success)
+        if bool(step.goes_on.all()):
+            states.append(env.env_state.state)
+    return total, success, states
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +270,9 @@ class Step:
     def goes_on(self) -> Tensor:
         """Whether the first episode of an environment is not over after it [B]."""
         return self.running & ~(self.terminated | self.truncated)
+
+
+Note = Callable[[ClothVectorEnv, tuple[int, ...], list[Step]], None]
 
 
 def steps_of(
@@ -281,12 +321,19 @@ def acting(owner: str, env: ClothVectorEnv, policy: Acts) -> Callable[[Tensor], 
     return act
 
 
-def _rows(owner: str, env: ClothVectorEnv, policy: Acts, seeds: Sequence[int]) -> dict[str, Tensor]:
+def _rows(
+    owner: str,
+    env: ClothVectorEnv,
+    policy: Acts,
+    seeds: tuple[int, ...],
+    note: Note | None = None,
+) -> dict[str, Tensor]:
     """The rows of `Episodes`, and the lengths of the episodes."""
     count = len(seeds)
     rows = {name: cpu.zeros(count, dtype=torch.bool) for name in _ROWS}
     rows["returns"] = cpu.zeros(count, dtype=torch.float32)
     rows["lengths"] = cpu.zeros(count, dtype=torch.int64)
+    steps: list[Step] = []
     with threads_of_torch(1):
         observation, _ = env.reset(seed=seeds)
         for step in steps_of(env, acting(owner, env, policy), observation):
@@ -297,6 +344,10 @@ def _rows(owner: str, env: ClothVectorEnv, policy: Acts, seeds: Sequence[int]) -
             rows["ever"] |= running & flags["success"]
             for name in ("failed", "blocked"):
                 rows[name] |= running & flags[name]
+            if note is not None:
+                steps.append(step)
+    if note is not None:
+        note(env, seeds, steps)
     return rows
 
 

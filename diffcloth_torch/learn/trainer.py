@@ -39,8 +39,8 @@ from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.evaluation import (
     episode_seeds,
     evaluate_starts,
+    follow,
     purpose_seed,
-    steps_of,
 )
 from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
 from diffcloth_torch.learn.options import TrainerOptions
@@ -276,15 +276,7 @@ class Trainer:
         each = self.task.horizon * self.task.example().state.nbytes
         check_memory("Trainer.evaluate: `episodes`", episodes, each, "an episode")
         env = self._make_env(num_envs=episodes)
-        total = cpu.zeros(episodes, dtype=torch.float32)
-        success = cpu.zeros(episodes, dtype=torch.bool)
-        observation, _ = env.reset(seed=seed)
-        states = [env.env_state.state]
-        for step in steps_of(env, self.act, observation):
-            total += torch.where(step.running, step.reward, 0.0)
-            success = torch.where(step.running, step.flags["success"], success)
-            if bool(step.goes_on.all()):
-                states.append(env.env_state.state)
+        total, success, states = follow(env, self.act, seed)
         return float(total.mean()), float(success.float().mean()), states
 
     def _record(self) -> dict[str, Any]:

@@ -81,7 +81,7 @@ PUBLIC = {
     "fabrics": "MEASUREMENTS Measurement material",
     "learn": (
         "Episodes Policy PolicySizes Processes Ranks RayActors Trainer TrainerOptions evaluate "
-        "load_policy"
+        "load_policy record"
     ),
     "robots": "GRIPPER panda",
     "stack": "",
