@@ -192,8 +192,8 @@ class _Job:
             raise InvalidInput("`evaluations` must be empty where no trainer is kept")
         self._tried = kept["tried"]
         if kept.get("best") is not None:
-            example = {**_BEST, "policy": dict(self.trainer.policy.state_dict())}
-            check_like("`best`", kept["best"], example)
+            like: dict[str, Any] = {**_BEST, "policy": dict(self.trainer.policy.state_dict())}
+            check_like("`best`", kept["best"], like)
             self._best = kept["best"]
         if kept.get("report") is not None:
             check_like("`report`", kept["report"], _REPORT)
@@ -331,7 +331,7 @@ class _Job:
             return True
         updates = [each["updates"] for each in evaluations[-2:]]
         fifths = [_LOOKS * count // self.section.updates for count in updates]
-        return fifths[-1] > fifths[0]
+        return bool(fifths[-1] > fifths[0])
 
     def _look(self) -> None:
         """Keep the policy if it is better than the best one so far."""

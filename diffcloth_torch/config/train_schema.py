@@ -12,6 +12,9 @@ from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLIN
 
 __all__ = ["EnvironmentSection", "TrainConfig", "TryoutSection", "WorkersSection"]
 
+Episodes = Annotated[int, Ge(1), Le(10**6)]
+"""A count of episodes: a day has fewer."""
+
 
 class EnvironmentSection(Section):
     """Name and options of a task, as in `dc.envs.make`."""
@@ -58,8 +61,8 @@ class TrainConfig(Section):
     updates: Updates = 100
     evaluate_every: Count = 10
     episodes: Count = 8
-    selection_episodes: Count = 16
-    report_episodes: Count = 64
+    selection_episodes: Episodes = 16
+    report_episodes: Episodes = 64
     until_success: Annotated[float, Ge(0), Le(1)] | None = None
     tryout: TryoutSection | None = None
     workers: WorkersSection = WorkersSection()

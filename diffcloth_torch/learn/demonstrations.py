@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import PART, as_path, writing
@@ -53,7 +52,6 @@ def record(
         InvalidInput: If an argument is not accepted, or Minari is not installed.
         OSError: If the folder cannot be written.
     """
-    check_count("record: `episodes`", episodes, 1)
     seeds = seeds_of("record", seed, episodes)
     folder = as_path("record: `path`", path)
     if not folder.parent.is_dir():
@@ -99,7 +97,7 @@ class _DataSet:
             buffers.append(
                 EpisodeBuffer(
                     id=self._count + i,
-                    seed=np.uint64(seed),  # type: ignore[arg-type]
+                    seed=np.uint64(seed),
                     observations=_float32([own[0].seen[i], *(step.after[i] for step in own)]),
                     actions=_float32([step.actions[i].clamp(-1, 1) for step in own]),
                     rewards=rows("reward"),

@@ -48,6 +48,7 @@ Acts = Callable[[Tensor], Any] | str
 PURPOSES = ("undo", "selection", "report")
 """Uses of starts in a training, which have no start in common."""
 
+_LARGEST_EPISODES = 10**6  # more than of a day
 _CHUNK = 8  # environments that step together
 _LARGEST_SEED = 2**64 - 1
 _SCRIPTED = ("scripted",)
@@ -150,7 +151,7 @@ def evaluate(
 
 def seeds_of(owner: str, seed: int, episodes: int) -> list[int]:
     """The seeds of the starts of episodes, of checked arguments."""
-    check_count(f"{owner}: `episodes`", episodes, 1)
+    check_count(f"{owner}: `episodes`", episodes, 1, _LARGEST_EPISODES)
     check_count(f"{owner}: `seed`", seed, 0, _LARGEST_SEED)
     return episode_seeds(seed, episodes)
 
