@@ -72,13 +72,13 @@ def write_checkpoint(path: Path, kind: str, content: object) -> None:
         file.write(text + digest.digest() + len(text).to_bytes(_LENGTH_SIZE, "little") + _MARK)
 
 
-def read_checkpoint(owner: str, path: Path, kind: str) -> Any:
+def read_checkpoint(owner: str, path: Path, *kinds: str) -> Any:
     """Read the content of a file whose digest is right.
 
     Args:
         owner: Opens messages.
         path: The file.
-        kind: Of the content, as in `write_checkpoint`.
+        kinds: Accepted ones of the content, as in `write_checkpoint`.
 
     Raises:
         InvalidInput: If the file has no such content, or was changed since it was written.
@@ -91,9 +91,11 @@ def read_checkpoint(owner: str, path: Path, kind: str) -> Any:
                 f"{owner}: {path} has the format {record['format']} of diffcloth_torch "
                 f"{record['version']}, this version reads {FORMAT}"
             )
-        if record["kind"] != kind:
+        if record["kind"] not in kinds:
+            accepted = " or a ".join(kinds)
             raise InvalidInput(
-                f"{owner}: {path} must be a checkpoint of a {kind}, got one of a {record['kind']}"
+                f"{owner}: {path} must be a checkpoint of a {accepted}, got one of a "
+                f"{record['kind']}"
             )
         file.seek(0)
         with refusing_damage(owner, path):

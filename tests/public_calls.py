@@ -38,6 +38,8 @@ WITHOUT_CALL = {
     "learn.RayActors": "needs a cluster",
     "learn.RayActors.close": "likewise",
     "learn.RayActors.map": "likewise",
+    "learn.record": "needs the extra `data`",
+    "learn.Policy.export": "needs the extra `onnx`",
     "learn.Processes.close": "ends processes",
     "learn.Processes.map": "starts processes, which share no defaults with this one",
     "learn.Workers": "is a protocol",
@@ -497,6 +499,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "envs.make_single": lambda w: call(dc.envs.make_single, "FoldCloth", size=5),
     "fabrics.Measurement": lambda w: call(dc.fabrics.Measurement, *MEASURED),
     "fabrics.material": lambda w: call(dc.fabrics.material, next(iter(dc.fabrics.MEASUREMENTS))),
+    "learn.Episodes": lambda w: call(
+        dc.learn.Episodes, w.observation[:, 0], *[mask()] * 4, steps=6, seeds=(1, 2)
+    ),
     "learn.Jobs": lambda w: call(dc.learn.Jobs, Inline()),
     "learn.Jobs.map": lambda w: call(dc.learn.Jobs(Inline()).map, float, ["1", "2"]),
     "learn.Policy": lambda w: call(seeded, dc.learn.Policy, w.env, dc.learn.TrainerOptions()),
@@ -504,15 +509,21 @@ CALLS: dict[str, Callable[[World], Call]] = {
         w.kept[0].policy.act, w.observation, torch.full_like(w.env.scripted_actions(), 0.1)
     ),
     "learn.Policy.forward": lambda w: call(w.kept[0].policy.forward, w.observation),
+    "learn.Policy.save": lambda w: call(w.kept[0].policy.save, w.folder / "policy.pt"),
+    "learn.PolicySizes": lambda w: call(dc.learn.PolicySizes, 7, 3, 6),
+    "learn.PolicySizes.of": lambda w: call(dc.learn.PolicySizes.of, w.env),
     "learn.Processes": lambda w: call(dc.learn.Processes, 1),
     "learn.Trainer": lambda w: call(dc.learn.Trainer, w.make_env, num_envs=2),
     "learn.Trainer.act": lambda w: call(w.kept[0].act, w.observation),
+    "learn.Trainer.check": lambda w: call(w.kept[0].check),
     "learn.Trainer.evaluate": lambda w: call(w.kept[0].evaluate, 2, 1),
     "learn.Trainer.load": lambda w: call(w.kept[0].load, w.kept[1]),
     "learn.Trainer.save": lambda w: call(w.kept[0].save, w.folder / "again.pt"),
     "learn.Trainer.update": lambda w: call(w.trainer.update),
     "learn.TrainerOptions": lambda w: call(dc.learn.TrainerOptions, "apg", 4),
     "learn.TrainerOptions.rate_share": lambda w: call(dc.learn.TrainerOptions().rate_share, 3),
+    "learn.evaluate": lambda w: call(dc.learn.evaluate, w.make_env, "scripted", 2, 1),
+    "learn.load_policy": lambda w: call(dc.learn.load_policy, w.kept[1]),
     "robots.panda": lambda w: call(dc.robots.panda),
     "residuals.markers": lambda w: call(
         residuals.markers, w.states, np.zeros((3, 12, 3)), np.ones((3, 12)), noise=0.1

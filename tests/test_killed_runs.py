@@ -28,6 +28,8 @@ chunk: 1
 updates: 4
 evaluate_every: 1
 episodes: 1
+selection_episodes: 1
+report_episodes: 1
 viewers: []
 """
 TRYOUT = "tryout: {seeds: [0, 1], updates: 2}\n"
@@ -62,7 +64,14 @@ CASES = {
     "train": (TRAIN, []),
     "train with a tryout": (TRAIN + TRYOUT, []),
 }
-UNCERTAIN = ("seconds", "forward_seconds", "backward_seconds", "phase_seconds", "cpu_seconds")
+UNCERTAIN = (
+    "seconds",
+    "forward_seconds",
+    "backward_seconds",
+    "phase_seconds",
+    "cpu_seconds",
+    "minutes",
+)
 
 
 def called(arguments):
@@ -105,7 +114,8 @@ def bits(command, out):
         kept = torch.load(out / "policy.pt", weights_only=True)
         numbers = [kept["policy"][name].numpy().tobytes() for name in sorted(kept["policy"])]
         record = json.loads((out / "train.json").read_text())
-        return numbers, kept["counts"], without_times([record["evaluations"], record["tried"]])
+        names = ("evaluations", "tried", "starts", "best", "report")
+        return numbers, without_times([record[name] for name in names])
     if command == "fit":
         return without_times(json.loads((out / "fit.json").read_text()))
     metrics = without_times(json.loads((out / "metrics.json").read_text()))

@@ -59,6 +59,8 @@ fit:
         ("train", f"num_envs={10**8}", "`num_envs` must be at most"),
         ("train", f"num_envs={10**400}", "`num_envs`"),
         ("train", f"episodes={10**8}", "`episodes` must be at most"),
+        ("train", f"selection_episodes={10**7}", "`selection_episodes` must be"),
+        ("train", f"report_episodes={10**7}", "`report_episodes` must be"),
         ("train", f"updates={10**8}", "`updates`"),
         ("train", f"evaluate_every={10**30}", "`evaluate_every`"),
         ("train", f"workers.count={10**6}", "`workers.count`"),

@@ -162,7 +162,9 @@ WITHOUT_REFUSAL = {
     "envs.EnvState.detach",
     "envs.Task.example",
     "fabrics.Measurement",
+    "learn.Episodes",
     "learn.Jobs",
+    "learn.Trainer.check",
     "learn.Trainer.update",
     "robots.panda",
 }

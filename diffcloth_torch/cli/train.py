@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 import time
 from collections.abc import Iterable
@@ -28,11 +29,18 @@ from diffcloth_torch.config.documents import read_document, set_values
 from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn.evaluation import (
+    PURPOSES,
+    episode_seeds,
+    evaluate,
+    follow,
+    purpose_seed,
+)
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.trainer import Trainer, record_of, restore
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.look import Camera, Pictures
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.show import show
@@ -43,6 +51,12 @@ __all__ = ["resume_training", "train"]
 _RESULT, _POLICY, _EVENTS = "train.json", "policy.pt", "events"
 _VIDEO = "evaluation"
 _EVALUATION = {"updates": 0, "steps": 0, "return": 0.0, "success": 0.0, "seconds": 0.0}
+_BEST = {"updates": 0, "success": 0.0, "return": 0.0}
+_REPORT = {
+    "episodes": 0, "success": 0.0, "interval": [0.0, 0.0], "ever": 0.0, "failed": 0.0,
+    "blocked": 0.0, "return": 0.0, "steps": 0, "minutes": 0.0,
+}  # fmt: skip
+_LOOKS = 5  # at policies, of which the best one is kept
 _NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # set by the trainer
 
 _Workers = Processes | RayActors | Ranks | None
@@ -115,6 +129,8 @@ class _Job:
         self.writes = _writes(workers)
         self.trainer = self._make(self._options)
         self._tried: list[dict[str, Any]] = []
+        self._best: dict[str, Any] | None = None
+        self._report: dict[str, Any] | None = None
 
     def _make(self, options: TrainerOptions) -> Trainer:
         section, env = self.section, self.section.environment
@@ -124,8 +140,9 @@ class _Job:
                     f"{self._source.name}: `environment.options` may not have {name!r}: "
                     "`num_envs` and the seed of `trainer` say it"
                 )
+        self._make_env = partial(envs.make, env.name, **env.options)
         return Trainer(
-            partial(envs.make, env.name, **env.options),
+            self._make_env,
             options,
             num_envs=section.num_envs,
             chunk=section.chunk,
@@ -147,7 +164,13 @@ class _Job:
             trainer: State of the trainer, None before its first evaluation.
         """
         document = self.section.model_dump(mode="json", exclude_unset=True)
-        found = {"evaluations": evaluations, "tried": self._tried, "trainer": trainer}
+        found = {
+            "evaluations": evaluations,
+            "tried": self._tried,
+            "trainer": trainer,
+            "best": self._best,
+            "report": self._report,
+        }
         write_resume(out, "train", document, self._source, **found)
 
     def restore(self, kept: dict[str, Any]) -> list[dict[str, Any]]:
@@ -168,17 +191,25 @@ class _Job:
         elif evaluations:
             raise InvalidInput("`evaluations` must be empty where no trainer is kept")
         self._tried = kept["tried"]
+        if kept.get("best") is not None:
+            like: dict[str, Any] = {**_BEST, "policy": dict(self.trainer.policy.state_dict())}
+            check_like("`best`", kept["best"], like)
+            self._best = kept["best"]
+        if kept.get("report") is not None:
+            check_like("`report`", kept["report"], _REPORT)
+            self._report = kept["report"]
         return evaluations
 
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
         """Learn until the end, and write the results."""
+        if self._report is not None:
+            return f"nothing is left to do: {self.trainer.updates} updates are done"
         before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
-        states: list[State] = []
         try:
             if self.section.tryout is not None:
-                states, evaluations = self._try_out(out, self.section.tryout, before)
-            last = self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
-            states = last or states
+                evaluations = self._try_out(out, self.section.tryout, before)
+            self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
+            self._report = self._reported(evaluations)
         except KeyboardInterrupt as error:
             kept = evaluations[-1]["updates"] if evaluations else 0
             raise KeyboardInterrupt(
@@ -188,44 +219,42 @@ class _Job:
         finally:
             if self._workers is not None:
                 self._workers.close()
-        if not states:
-            return f"nothing is left to do: {self.trainer.updates} updates are done"
         if self.writes:
-            self._film(out, states)
-        end = evaluations[-1]
+            self._write(out, evaluations)
+            self._film(out)
+        found = self._report
+        low, high = found["interval"]
         seeds = [each["seed"] for each in self._tried]
         best = f"seed {self.trainer.options.seed}, the best of {seeds}: " if seeds else ""
         return best + (
-            f"{end['steps']} environment steps in {end['seconds']:.0f} s: return "
-            f"{evaluations[0]['return']:.4g} -> {end['return']:.4g}, "
-            f"success {end['success']:.0%}; results are in {out}"
+            f"success {found['success']:.0%} ({low:.0%} to {high:.0%}) in {found['episodes']} "
+            f"fresh episodes, return {found['return']:.4g}, {found['steps']} environment steps, "
+            f"{found['minutes']:.1f} minutes; results are in {out}"
         )
 
-    def _try_out(
-        self, out: Path, tryout: TryoutSection, before: float
-    ) -> tuple[list[State], list[dict[str, Any]]]:
+    def _try_out(self, out: Path, tryout: TryoutSection, before: float) -> list[dict[str, Any]]:
         """Train each seed for a while; this object then trains the best one.
 
         Returns:
-            The states of the best seed's last evaluation, and all its evaluations.
+            All evaluations of the best one.
         """
         found = []
         for seed in tryout.seeds:
-            self.trainer = self._make(replace(self._options, seed=seed))
+            self.trainer, self._best = self._make(replace(self._options, seed=seed)), None
             evaluations: list[dict[str, Any]] = []
             updates = min(tryout.updates, self.section.updates)
-            states = self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
+            self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
             self._tried.append({"seed": seed, **evaluations[-1]})
-            found.append((self.trainer, states, evaluations))
+            found.append((self.trainer, self._best, evaluations))
             if self._succeeds(evaluations):
                 break
         # The first one among equals.
-        self.trainer, states, evaluations = max(found, key=lambda each: each[2][-1]["return"])
+        self.trainer, self._best, evaluations = max(found, key=lambda each: each[2][-1]["return"])
         trained = {**self.section.trainer, "seed": self.trainer.options.seed}
         self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
         if self.writes:
             self._write(out, evaluations)
-        return states, evaluations
+        return evaluations
 
     def _learn(
         self,
@@ -234,7 +263,7 @@ class _Job:
         before: float,
         log: Path,
         out: Path | None = None,
-    ) -> list[State]:
+    ) -> None:
         """Learn until a number of updates is done or enough episodes succeed.
 
         Args:
@@ -242,10 +271,7 @@ class _Job:
             evaluations: Evaluations so far; more are appended.
             before: Start time of the training.
             log: Folder of TensorBoard's events.
-            out: Folder in which each evaluation and its policy are kept.
-
-        Returns:
-            The states of the last evaluation; empty if nothing was left to do.
+            out: Folder in which each evaluation and the best policy are kept.
         """
         from torch.utils.tensorboard import SummaryWriter
 
@@ -257,7 +283,6 @@ class _Job:
             desc="train" if section.tryout is None else f"seed {trainer.options.seed}",
             disable=None if self.writes else True,
         )
-        states: list[State] = []
         try:
             while not evaluations or (
                 trainer.updates < updates and not self._succeeds(evaluations)
@@ -267,10 +292,14 @@ class _Job:
                     bar.update()
                     for name, value in scalars.items() if events else ():
                         events.add_scalar(name, value, trainer.steps)
+                    if trainer.updates == section.updates:
+                        self._check()
                     is_last = trainer.updates == updates
                     if trainer.updates % section.evaluate_every and not is_last:
                         continue
-                states, found = self._evaluate()
+                found = self._evaluate()
+                if self._is_looked_at([*evaluations, found]):
+                    self._look()
                 evaluations.append(found | {"seconds": time.perf_counter() - before})
                 bar.set_postfix({"return": f"{found['return']:.4g}"})
                 for name in ("return", "success") if events else ():
@@ -281,26 +310,108 @@ class _Job:
             bar.close()
             if events:
                 events.close()
-        return states
 
     def _succeeds(self, evaluations: list[dict[str, Any]]) -> bool:
         enough = self.section.until_success
         return enough is not None and bool(evaluations[-1]["success"] >= enough)
 
-    def _evaluate(self) -> tuple[list[State], dict[str, Any]]:
-        value, success, states = self.trainer.evaluate(self.section.episodes)
+    def _evaluate(self) -> dict[str, Any]:
+        value, success, _ = self.trainer.evaluate(self.section.episodes)
         counts = {"updates": self.trainer.updates, "steps": self.trainer.steps}
-        return states, counts | {"return": value, "success": success}
+        return counts | {"return": value, "success": success}
+
+    def _check(self) -> None:
+        """Check the last policy where the last update has not done so."""
+        if self.trainer.updates % self.trainer.options.check_every:
+            self.trainer.check()
+
+    def _is_looked_at(self, evaluations: list[dict[str, Any]]) -> bool:
+        """Whether a policy that was evaluated is the last one, or the first one of a fifth."""
+        if self._succeeds(evaluations):
+            return True
+        updates = [each["updates"] for each in evaluations[-2:]]
+        fifths = [_LOOKS * count // self.section.updates for count in updates]
+        return bool(fifths[-1] > fifths[0])
+
+    def _look(self) -> None:
+        """Keep the policy if it is better than the best one so far."""
+        trainer, seed = self.trainer, purpose_seed(self.trainer.options.seed, "selection")
+        found = evaluate(
+            self._make_env,
+            trainer.policy,
+            self.section.selection_episodes,
+            seed,
+            workers=self._workers,
+        )
+        value = {"success": found.success_rate, "return": found.mean_return}
+        best = self._best
+        if best is None or tuple(value.values()) > (best["success"], best["return"]):
+            weights = {name: t.clone() for name, t in trainer.policy.state_dict().items()}
+            self._best = {"updates": trainer.updates, **value, "policy": weights}
+
+    def _policy(self) -> Policy:
+        """The best policy so far, or the present one before the first look."""
+        policy = copy.deepcopy(self.trainer.policy)
+        if self._best is not None:
+            policy.load_state_dict(self._best["policy"])
+        return policy
+
+    def _reported(self, evaluations: list[dict[str, Any]]) -> dict[str, Any]:
+        """How well the best policy does from starts that nothing before has seen."""
+        seed = purpose_seed(self.trainer.options.seed, "report")
+        found = evaluate(
+            self._make_env,
+            self._policy(),
+            self.section.report_episodes,
+            seed,
+            workers=self._workers,
+        )
+        shares = {
+            name: float(getattr(found, name).float().mean())
+            for name in ("success", "ever", "failed", "blocked")
+        }
+        return {
+            "episodes": len(found),
+            **shares,
+            "interval": list(found.interval),
+            "return": found.mean_return,
+            "steps": self.trainer.steps,
+            "minutes": evaluations[-1]["seconds"] / 60,
+        }
+
+    @property
+    def _starts(self) -> dict[str, list[int]]:
+        """Seeds of the starts of each purpose."""
+        seed, section = self.trainer.options.seed, self.section
+        counts = (
+            self.trainer.options.held_out or 0, section.selection_episodes, section.report_episodes
+        )  # fmt: skip
+        return {
+            purpose: episode_seeds(purpose_seed(seed, purpose), count)
+            for purpose, count in zip(PURPOSES, counts, strict=True)
+        }
 
     def _write(self, out: Path, evaluations: list[dict[str, Any]]) -> None:
         config = self.section.model_dump(mode="json")
-        result = {"config": config, "evaluations": evaluations, "tried": self._tried}
+        best = None if self._best is None else {name: self._best[name] for name in _BEST}
+        result = {
+            "config": config,
+            "evaluations": evaluations,
+            "tried": self._tried,
+            "starts": self._starts,
+            "best": best,
+            "report": self._report,
+        }
         write_metrics(out / _RESULT, result)
-        self.trainer.save(out / _POLICY)
+        self._policy().save(out / _POLICY)
         self.keep(out, evaluations, record_of(self.trainer))
 
-    def _film(self, out: Path, states: list[State]) -> None:
-        """Show the first episode of the last evaluation, or all of them in the browser."""
+    def _film(self, out: Path) -> None:
+        """Show the best policy in the first episode of the report, or in the browser in several."""
+        if not self.section.viewers:
+            return
+        seeds = self._starts["report"][: self.section.episodes]
+        _, _, states = follow(self._make_env(num_envs=len(seeds)), self._policy(), seeds)
         task, options = self.trainer.task, self.section.pictures.model_dump()
         scene: Scene = task.simulator.scene
         camera = Camera(**options["camera"])

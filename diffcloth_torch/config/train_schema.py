@@ -12,6 +12,9 @@ from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLIN
 
 __all__ = ["EnvironmentSection", "TrainConfig", "TryoutSection", "WorkersSection"]
 
+Episodes = Annotated[int, Ge(1), Le(10**6)]
+"""A count of episodes: a day has fewer."""
+
 
 class EnvironmentSection(Section):
     """Name and options of a task, as in `dc.envs.make`."""
@@ -42,10 +45,12 @@ class TryoutSection(Section):
 class TrainConfig(Section):
     """Environments, the options of `TrainerOptions`, and the length of training.
 
-    The policy is evaluated, and kept, at first, after each `evaluate_every` updates and at the end,
-    in `episodes` separate episodes. With `until_success` training ends before its last update, as
-    soon as this share of episodes succeeds. With `tryout` the seed of `trainer` is the one with the
-    largest return after the updates of the tryout, which count as the first ones.
+    The policy is evaluated at first, after each `evaluate_every` updates and at the end, in
+    `episodes` episodes of their own. At most five of these policies are compared, in
+    `selection_episodes` others, by their success and then by their return; the best is kept, and at
+    the end reported in `report_episodes` fresh ones. With `until_success` training ends before its
+    last update, as soon as that share of `episodes` succeeds. With `tryout` the seed of `trainer`
+    is the one with the largest return after the updates there, which count as the first ones.
     """
 
     task: Literal["train"]
@@ -56,6 +61,8 @@ class TrainConfig(Section):
     updates: Updates = 100
     evaluate_every: Count = 10
     episodes: Count = 8
+    selection_episodes: Episodes = 16
+    report_episodes: Episodes = 64
     until_success: Annotated[float, Ge(0), Le(1)] | None = None
     tryout: TryoutSection | None = None
     workers: WorkersSection = WorkersSection()

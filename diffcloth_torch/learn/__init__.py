@@ -7,18 +7,25 @@
 ...     log = trainer.update()
 """
 
+from diffcloth_torch.learn.demonstrations import record
+from diffcloth_torch.learn.evaluation import Episodes, evaluate
 from diffcloth_torch.learn.options import TrainerOptions
-from diffcloth_torch.learn.rollouts import Policy
+from diffcloth_torch.learn.policy import Policy, PolicySizes, load_policy
 from diffcloth_torch.learn.trainer import Trainer
 from diffcloth_torch.learn.workers import Jobs, Processes, Ranks, RayActors, Workers
 
 __all__ = [
+    "Episodes",
     "Jobs",
     "Policy",
+    "PolicySizes",
     "Processes",
     "Ranks",
     "RayActors",
     "Trainer",
     "TrainerOptions",
     "Workers",
+    "evaluate",
+    "load_policy",
+    "record",
 ]

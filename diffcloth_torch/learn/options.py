@@ -62,6 +62,15 @@ class TrainerOptions:
             alone.
         plan_rate: Learning rate of Adam for the plan; the linear function has that of the policy.
         hidden: Sizes of hidden layers.
+        max_change: Largest change of actions by an update: root mean square, without noise, over
+            the observations of the rollout. A larger update is scaled back, and the scale of
+            observations, on which actions depend, too, stays as it was after the first update or in
+            the policy that training begins at. None: 0.02 for a training that begins at a policy,
+            otherwise no bound. As actions lie between -1 and 1, 2 bounds no update.
+        held_out: Number of starts, which no rollout has, at which the policy is checked at first
+            and after every `check_every` updates: where success there has fallen, the policy is
+            restored. None: 16 for a training that begins at a policy, otherwise 0; 0: no checks.
+        check_every: Updates from one check to the next.
         seed: Of networks, noise and starts.
 
     Raises:
@@ -93,13 +102,16 @@ class TrainerOptions:
     plan_rate: float = 4e-2
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
+    max_change: float | None = None
+    held_out: int | None = None
+    check_every: int = 10
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
         check_choice("TrainerOptions: `scale`", self.scale, SCALES)
         if not isinstance(self.feedback, bool):
             raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
-        for name in ("horizon", "critic_epochs", "critic_batches", "critics"):
+        for name in ("horizon", "critic_epochs", "critic_batches", "critics", "check_every"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1, _LARGEST_COUNT)
         for name in ("critic_only", "decay_updates", "plan_knots", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
@@ -108,6 +120,10 @@ class TrainerOptions:
         accepted = f"positive and below {_LARGEST:g}"
         for name in _POSITIVE:
             _check_number(name, getattr(self, name), lambda v: 0 < v < _LARGEST, accepted)
+        if self.max_change is not None:
+            _check_number("max_change", self.max_change, lambda v: 0 < v < _LARGEST, accepted)
+        if self.held_out is not None:
+            check_count("TrainerOptions: `held_out`", self.held_out, 0, _LARGEST_COUNT)
         _check_number("target_entropy", self.target_entropy, math.isfinite, "finite")
         for name in ("betas", "hidden", "first_action"):
             value = getattr(self, name)

@@ -10,7 +10,6 @@ import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -19,99 +18,21 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.gym import ClothVectorEnv
-from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.learn.networks import Actor, Critics, Scale
 from diffcloth_torch.learn.options import TrainerOptions
-from diffcloth_torch.memory import check_memory
+from diffcloth_torch.learn.policy import Policy
 
 __all__ = [
     "MakeEnv",
     "Piece",
-    "Policy",
     "Rollout",
+    "environments",
     "roll_out",
     "roll_out_remotely",
     "threads_of_torch",
 ]
 
-_WEIGHT_BYTES = 16  # with its gradient and the moments of Adam
-
 MakeEnv = Callable[..., ClothVectorEnv]
 """A function that makes environments, as `dc.envs.make` does; called with `num_envs` by name."""
-
-
-class Policy(torch.nn.Module):
-    """A policy, its critics, slower copies that they aim at, and the scale of what they see.
-
-    Attributes:
-        log_temperature: Logarithm of what a unit of entropy is worth; of "sapo" alone.
-    """
-
-    def __init__(self, env: ClothVectorEnv, options: TrainerOptions) -> None:
-        """Make networks for the observations and actions of environments."""
-        super().__init__()
-        observations = env.task.observation(env.task.example()).shape[-1]
-        self.observations = int(observations)
-        _check_size(self.observations, env.task.action_size, options)
-        first = options.first_action or [0.0] * env.task.action_size
-        self.actor = Actor(
-            observations,
-            cpu.tensor(first, dtype=torch.float32),
-            options.hidden,
-            options.deviation,
-            sees_width=options.has_entropy,
-            knots=options.plan_knots,
-        )
-        self._time = _place_of_time(env) if options.plan_knots else None
-        critics = options.critics if options.has_entropy else 1
-        self.critics = Critics(observations, options.hidden, critics)
-        self.targets = Critics(observations, options.hidden, critics)
-        self.targets.load_state_dict(self.critics.state_dict())
-        self.scale = Scale(observations)
-        self.log_temperature = torch.nn.Parameter(
-            cpu.tensor(options.temperature, dtype=torch.float32).log()
-        )
-        self._has_entropy = options.has_entropy
-
-    @property
-    def temperature(self) -> float:
-        """What a unit of entropy is worth, in units of reward."""
-        return float(self.log_temperature.detach().exp()) if self._has_entropy else 0.0
-
-    def forward(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
-        if noise is None:
-            noise = cpu.zeros(1, dtype=torch.float32)
-        return self.act(observation, noise)[0]
-
-    def act(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, A], and minus the logarithm of their density [B]; see `Actor`."""
-        time = None if self._time is None else observation[:, self._time]
-        actions, entropy = self.actor(self.scale(observation), noise, time)
-        return actions, entropy
-
-
-def _check_size(observations: int, actions: int, options: TrainerOptions) -> None:
-    """Refuse networks that do not fit into memory, before they are made."""
-    sizes = [observations, *options.hidden]
-    inner = sum((before + 3) * after for before, after in pairwise(sizes))
-    critics = 2 * (options.critics if options.has_entropy else 1)  # and their slower copies
-    weights = (1 + critics) * (inner + (sizes[-1] + 1) * 2 * actions)
-    names = "TrainerOptions: the weights by `hidden` and `critics`"
-    check_memory(names, weights, _WEIGHT_BYTES, "a weight")
-    knots = "TrainerOptions: `plan_knots`"
-    check_memory(knots, options.plan_knots, actions * _WEIGHT_BYTES, "a knot")
-
-
-def _place_of_time(env: ClothVectorEnv) -> int:
-    slices = env.task.observation_slices
-    if "time" not in slices:
-        raise InvalidInput(
-            f"TrainerOptions: `plan_knots` must be 0 for {env.task.name}, "
-            'which does not observe its "time"'
-        )
-    place: int = slices["time"].start
-    return place
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,12 +150,22 @@ def roll_out_remotely(work: tuple[bytes, Piece]) -> Rollout:
         work: A pickled `MakeEnv`, and the piece.
     """
     make_env, piece = work
-    key = make_env, len(piece.start)
     with threads_of_torch(piece.threads):
-        if key not in _made:
-            make: Any = pickle.loads(make_env)
-            _made[key] = make(num_envs=len(piece.start))
-        return roll_out(_made[key], piece)
+        return roll_out(environments(make_env, len(piece.start)), piece)
+
+
+def environments(make_env: bytes, count: int) -> ClothVectorEnv:
+    """Environments of this process, which last for later pieces.
+
+    Args:
+        make_env: A pickled `MakeEnv`.
+        count: Number of environments.
+    """
+    key = make_env, count
+    if key not in _made:
+        make: Any = pickle.loads(make_env)
+        _made[key] = make(num_envs=count)
+    return _made[key]
 
 
 @contextmanager

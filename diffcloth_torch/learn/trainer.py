@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -31,29 +30,34 @@ from diffcloth_torch.checkpoint import (
     refusing_damage,
     write_checkpoint,
 )
-from diffcloth_torch.checks import check_count, check_shape, refuse_threads
+from diffcloth_torch.checks import check_count, check_shape
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.adam import TensorAdam
+from diffcloth_torch.learn.evaluation import (
+    episode_seeds,
+    evaluate_starts,
+    follow,
+    purpose_seed,
+)
+from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.policy import TRAINER, Policy, begin_at, file_to_write
 from diffcloth_torch.learn.rollouts import (
     MakeEnv,
     Piece,
-    Policy,
     Rollout,
     roll_out,
     roll_out_remotely,
     threads_of_torch,
 )
-from diffcloth_torch.learn.workers import Ranks, Workers
+from diffcloth_torch.learn.workers import Ranks, Workers, check_workers, pickled
 from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Trainer", "record_of", "restore"]
-
-_CHECKPOINT = "trainer"  # kind of its files
 
 
 class Trainer:
@@ -64,9 +68,11 @@ class Trainer:
 
     Attributes:
         policy: The policy and its critic.
-        options: As given.
-        steps: Environment steps so far.
+        options: As given, or those of fine-tuning where `init` is given.
+        steps: Environment steps of rollouts so far.
         updates: Of the policy so far.
+        held_out: Seeds of the starts at which the policy is checked; see `TrainerOptions`.
+        undone: How often a check has restored an earlier policy.
     """
 
     def __init__(
@@ -78,28 +84,39 @@ class Trainer:
         chunk: int | None = None,
         workers: Workers | None = None,
         threads: int = 1,
+        init: Policy | None = None,
     ) -> None:
         """Make the networks, and begin episodes.
 
         Args:
             make_env: Makes environments that begin anew in the step in which they end:
                 `functools.partial(dc.envs.make, "FoldCloth", size=12)`.
-            options: How to learn.
+            options: How to learn; None for those of `init`, or else the defaults.
             num_envs: Number of environments in a rollout.
             chunk: Number of them that step together; all by default. It must divide `num_envs`.
             workers: What makes the rollouts of chunks; None makes them here.
             threads: Of torch in an update, here and in each worker. Results depend on it in the
                 last bits.
+            init: A policy at whose weights training begins, of the same observations and actions,
+                hidden layers and number of knots. Its algorithm, task, horizon and rates may be
+                others. Then updates are bounded and checked by default: see `max_change` and
+                `held_out` of `TrainerOptions`.
 
         Raises:
             InvalidInput: If an argument is not accepted.
         """
-        self.options = TrainerOptions() if options is None else options
+        if init is not None and not isinstance(init, Policy):
+            raise TypeError(f"Trainer: `init` must be a Policy, got {type(init).__name__}")
+        if options is None:
+            options = TrainerOptions() if init is None else init.options
+        self.options = options
         given: object = self.options
         if not isinstance(given, TrainerOptions):
             raise TypeError(
                 f"Trainer: `options` must be TrainerOptions, got {type(given).__name__}"
             )
+        if init is not None:
+            self.options = for_fine_tuning(options)
         if not callable(make_env):
             raise TypeError(
                 f"Trainer: `make_env` must be a function that makes environments, got {make_env!r}"
@@ -108,33 +125,25 @@ class Trainer:
         check_count("Trainer: `num_envs`", num_envs, 1)
         if num_envs % self._chunk:
             raise InvalidInput(f"Trainer: `chunk` must divide {num_envs}, got {chunk}")
-        refuse_threads("Trainer: `workers`", workers)
-        if workers is not None and (
-            isinstance(workers, type) or not callable(getattr(workers, "map", None))
-        ):
-            raise TypeError(
-                "Trainer: `workers` must have `map`, as dc.learn.Processes(2) and executors do, "
-                f"got {workers!r}"
-            )
+        check_workers("Trainer: `workers`", workers)
         self._make_env, self._workers = make_env, workers
         self._threads = check_count("Trainer: `threads`", threads, 1)
-        self._pickled = b"" if workers is None else _pickled(make_env)
+        self._pickled = (
+            b"" if workers is None else pickled("Trainer: with `workers`, `make_env`", make_env)
+        )
         self._env = begins_anew("Trainer: `make_env`", make_env(num_envs=self._chunk))
         self._count = num_envs
         each = self._env.task.example().state.nbytes
         check_memory("Trainer: `num_envs`", num_envs, each, "a state")
         horizon = self.options.horizon
         check_memory("TrainerOptions: `horizon`", horizon, self._chunk * each, "a step")
-        actions, first = self.task.action_size, self.options.first_action
-        if first is not None and len(first) != actions:
-            raise InvalidInput(
-                f"TrainerOptions: `first_action` must have {actions} numbers, got {len(first)}"
-            )
         o = self.options
         self._noise = cpu.generator().manual_seed(o.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(o.seed)
             self.policy = Policy(self._env, o)
+        if init is not None:
+            begin_at("Trainer: `init`", self.policy, init)
         self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
         plan = self.policy.actor.plan
         knots = [] if plan is None else [plan.knots]
@@ -149,7 +158,10 @@ class Trainer:
         self._temperature_steps = torch.optim.Adam(
             [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
         )
-        self.steps = self.updates = 0
+        self.steps = self.updates = self.undone = 0
+        starts = episode_seeds(purpose_seed(o.seed, "undo"), o.held_out or 0)
+        self.held_out: tuple[int, ...] = tuple(starts)
+        self._kept: Kept | None = None
         self._return = cpu.zeros(num_envs, dtype=torch.float32)
 
     @property
@@ -177,7 +189,9 @@ class Trainer:
             What to log: "loss", "gradient_norm" before it is limited, "reward" (the mean of the
             rollout), "failed" (share of steps), "entropy" (of the policy, per number of an action),
             "critic_loss", "temperature" and, where episodes ended, their mean "return" and share of
-            "success".
+            "success". With `max_change` also "change", of actions by the update, and "step_share",
+            the share of the update that was made; after a check "held_out", the share of successes,
+            and "undone", 1 where an earlier policy was restored.
 
         Raises:
             SimulationError: If a gradient is not finite.
@@ -191,11 +205,17 @@ class Trainer:
         for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
             group["lr"] = share * rate
         self._critic_steps.param_groups[0]["lr"] = share * o.critic_rate
+        if self.held_out and self._kept is None:
+            self.check()
         rollouts = self._rollouts()
+        rows = _Rows(rollouts)
         log = {"loss": sum(r.loss for r in rollouts)}
         learns = not self.options.has_critic or self.updates >= self.options.critic_only
+        seen = rows.seen.flatten(0, 1)
+        region = None if o.max_change is None else TrustRegion(self.policy, seen, o.max_change)
         log["gradient_norm"] = self._step_actor(rollouts, learns)
-        rows = _Rows(rollouts)
+        if region is not None:
+            log["change"], log["step_share"] = region.limit()
         log["reward"] = float(rows.rewards.mean())
         log["failed"] = float(rows.failed.float().mean())
         log["entropy"] = float(rows.entropies.mean()) / self.task.action_size
@@ -204,11 +224,41 @@ class Trainer:
         if self.options.has_entropy:
             log["temperature"] = self.policy.temperature
             self._step_temperature(log["entropy"])
-        self.policy.scale.see(rows.seen.flatten(0, 1))
+        if region is None or not float(self.policy.scale.count):
+            self.policy.scale.see(seen)
         self._places = [(r.end, r.generators) for r in rollouts]
         self.steps += rows.rewards.numel()
         self.updates += 1
-        return log | self._ended(rows)
+        log |= self._ended(rows)
+        if self.held_out and self.updates % o.check_every == 0:
+            log |= self.check()
+        return log
+
+    def check(self) -> dict[str, float]:
+        """Follow the policy from the held-out starts, and restore the last good one if it is worse.
+
+        `update` does so after every `check_every` updates. At the end of a fine-tuning, this makes
+        sure that its policy succeeds there as often as the one that it began at.
+
+        Returns:
+            "held_out": the share of successes of the policy that was checked; "undone": 1 if an
+            earlier policy, whose share was larger, was restored. Empty without held-out starts.
+        """
+        if not self.held_out:
+            return {}
+        found = evaluate_starts(
+            "Trainer.check", self._make_env, self.policy, self.held_out, workers=self._workers
+        )
+        success, kept = found.success_rate, self._kept
+        undone = kept is not None and success < kept.success
+        if kept is not None and undone:
+            kept.restore(self.policy, self._actor_steps)
+            self.undone += 1
+        else:
+            weights = Kept.weights_of(self.policy)
+            steps = copy.deepcopy(self._actor_steps.state_dict())
+            self._kept = Kept(self.updates, success, weights, steps)
+        return {"held_out": success, "undone": float(undone)}
 
     def evaluate(self, episodes: int = 8, seed: int = 0) -> tuple[float, float, list[State]]:
         """Follow the policy without noise.
@@ -226,20 +276,7 @@ class Trainer:
         each = self.task.horizon * self.task.example().state.nbytes
         check_memory("Trainer.evaluate: `episodes`", episodes, each, "an episode")
         env = self._make_env(num_envs=episodes)
-        observation, _ = env.reset(seed=seed)
-        total, running = (
-            cpu.zeros(episodes, dtype=torch.float32),
-            cpu.ones(episodes, dtype=torch.bool),
-        )
-        success = cpu.zeros(episodes, dtype=torch.bool)
-        states = [env.env_state.state]
-        while bool(running.any()):
-            observation, reward, terminated, truncated, info = env.step(self.act(observation))
-            total += torch.where(running, reward, 0.0)
-            success = torch.where(running, info.get("final_info", info)["success"], success)
-            running = running & ~(terminated | truncated)
-            if bool(running.all()):
-                states.append(env.env_state.state)
+        total, success, states = follow(env, self.act, seed)
         return float(total.mean()), float(success.float().mean()), states
 
     def _record(self) -> dict[str, Any]:
@@ -247,6 +284,8 @@ class Trainer:
             "options": asdict(self.options),
             "task": self._described,
             "counts": [self.steps, self.updates],
+            "undone": self.undone,
+            "kept": None if self._kept is None else copy.deepcopy(vars(self._kept)),
             "return": self._return.clone(),
             "noise": self._noise.get_state(),
             "policy": {name: t.clone() for name, t in self.policy.state_dict().items()},
@@ -260,11 +299,15 @@ class Trainer:
     def _load(self, owner: str, given: Any) -> None:
         """Check a record completely, then go on with it."""
         own = self._record()
+        if isinstance(given, Mapping):  # files before there was fine-tuning have neither
+            given = {"undone": 0, "kept": None} | dict(given)
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
         if given["task"] != own["task"]:
             raise InvalidInput(f"{owner} is of {given['task']}, not of {own['task']}")
-        if given["options"] != own["options"]:
+        if not isinstance(given["options"], dict) or (
+            asdict(TrainerOptions()) | given["options"] != own["options"]
+        ):
             raise InvalidInput(f"{owner} was written with other options")
         places = self._checked_places(owner, given["places"])
         check_like(f"{owner}['counts']", given["counts"], own["counts"])
@@ -280,11 +323,19 @@ class Trainer:
         check_like(f"{owner}['optimizers']", [None] * len(given["optimizers"]), [None] * 3)
         for k, optimizer in enumerate(self._optimizers):
             check_optimizer(f"{owner}['optimizers'][{k}]", given["optimizers"][k], optimizer)
+        check_like(f"{owner}['undone']", given["undone"], 0)
+        last_good: Kept | None = None
+        if given["kept"] is not None:
+            name = f"{owner}['kept']"
+            if not self.held_out:
+                raise InvalidInput(f"{name} must be None without held-out starts")
+            last_good = Kept.checked(name, given["kept"], self.policy, self._actor_steps, updates)
         # Everything is checked: from here on nothing may fail.
         self.policy.load_state_dict(given["policy"])
         for optimizer, kept in zip(self._optimizers, given["optimizers"], strict=True):
             optimizer.load_state_dict(kept)
         self.steps, self.updates = steps, updates
+        self.undone, self._kept = given["undone"], copy.deepcopy(last_good)
         self._return = given["return"].clone()
         self._noise.set_state(given["noise"])
         self._places = places
@@ -325,10 +376,7 @@ class Trainer:
             InvalidInput: If its folder does not exist.
             OSError: If it cannot be written; an older file stays as it is.
         """
-        path = as_path("Trainer.save: `path`", path)
-        if not path.parent.is_dir():
-            raise InvalidInput(f"Trainer.save: the folder of `path` must exist, got {str(path)!r}")
-        write_checkpoint(path, _CHECKPOINT, self._record())
+        write_checkpoint(file_to_write("Trainer.save", path), TRAINER, self._record())
 
     def load(self, path: str | Path) -> None:
         """Go on with the content of a file of `save`, to the same bits.
@@ -340,7 +388,7 @@ class Trainer:
         path = as_path("Trainer.load: `path`", path)
         if not path.is_file():
             raise InvalidInput(f"Trainer.load: `path` must be a file, got {str(path)!r}")
-        kept = read_checkpoint("Trainer.load", path, _CHECKPOINT)
+        kept = read_checkpoint("Trainer.load", path, TRAINER)
         with refusing_damage("Trainer.load", path):
             self._load("the trainer", kept)
 
@@ -530,13 +578,3 @@ def _lambda_returns(
         time_dim=0,
     )
     return result[..., 0]
-
-
-def _pickled(make_env: MakeEnv) -> bytes:
-    try:
-        return pickle.dumps(make_env)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise InvalidInput(
-            "Trainer: with `workers`, `make_env` must be a function of a module, or such as "
-            f"functools.partial(dc.envs.make, 'FoldCloth'), that can be pickled: {error}"
-        ) from error

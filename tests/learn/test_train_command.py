@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from click.testing import CliRunner
 
+from diffcloth_torch import envs
 from diffcloth_torch.cli import main
-from diffcloth_torch.learn import Trainer
+from diffcloth_torch.cli import train as train_module
+from diffcloth_torch.learn import Trainer, evaluate, load_policy
+from diffcloth_torch.learn.evaluation import episode_seeds, purpose_seed
 
 SHORT = """
 task: train
@@ -21,8 +26,13 @@ num_envs: 2
 updates: 4
 evaluate_every: 2
 episodes: 2
+selection_episodes: 2
+report_episodes: 3
 pictures: {video: none, size: [64, 64], sheet: 2}
 """
+
+
+MAKE = functools.partial(envs.make, "FoldCloth", size=6, horizon=5, opens_at=-1.0, reach=0.06)
 
 
 @pytest.fixture
@@ -37,7 +47,11 @@ def call(*arguments):
 
 
 def policy(folder):
-    return torch.load(folder / "policy.pt", weights_only=True)
+    return torch.load(folder / "policy.pt", weights_only=True)["policy"]
+
+
+def record_of(folder):
+    return json.loads((folder / "train.json").read_text())
 
 
 def test_results(config, tmp_path):
@@ -75,13 +89,76 @@ def test_an_interrupted_training_goes_on_with_the_same_bits(config, tmp_path, mo
     assert "after 3 updates, of which 2 are kept" in result.output
     result = call("--resume", cut)
     assert result.exit_code == 0, result.output
-    a, b = policy(whole), policy(cut)
-    assert a["counts"] == b["counts"] == [32, 4]
-    for name, tensor in a["policy"].items():
-        assert torch.equal(tensor, b["policy"][name]), name
-    records = [json.loads((f / "train.json").read_text())["evaluations"] for f in (whole, cut)]
-    assert [e["return"] for e in records[0]] == [e["return"] for e in records[1]]
+    assert same_policies(whole, cut)
+    records = [record_of(folder) for folder in (whole, cut)]
+    evaluations = [record["evaluations"] for record in records]
+    assert [e["steps"] for e in evaluations[0]] == [0, 16, 32]
+    assert [e["return"] for e in evaluations[0]] == [e["return"] for e in evaluations[1]]
+    for record in records:
+        del record["report"]["minutes"]
+    for name in ("starts", "best", "report"):
+        assert records[0][name] == records[1][name]
     assert "nothing is left" in call("--resume", cut).output
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """Success and return at each look, one after the other; and the updates at each."""
+    given, at = [], []
+    real = train_module.evaluate
+
+    def found(make_env, policy, episodes, seed, *, workers):
+        episodes = real(make_env, policy, episodes, seed, workers=workers)
+        if seed == purpose_seed(0, "selection"):
+            success, value = given.pop(0)
+            at.append({name: t.clone() for name, t in policy.state_dict().items()})
+            flags = torch.full_like(episodes.success, success)
+            returns = torch.full_like(episodes.returns, value)
+            return replace(episodes, success=flags, returns=returns)
+        return episodes
+
+    monkeypatch.setattr(train_module, "evaluate", found)
+    return given, at
+
+
+def test_the_best_policy_is_kept_and_reported(config, tmp_path, looks):
+    """By success, then by return, at five looks of seven evaluations; the first of equals."""
+    given, at = looks
+    given[:] = [(False, 3.0), (True, 1.0), (True, 2.0), (True, 2.0), (False, 9.0)]
+    out = tmp_path / "out"
+    changes = ("updates=6", "evaluate_every=1", "viewers=[]")
+    result = call(config, "--out", out, *(f"--set={change}" for change in changes))
+    assert result.exit_code == 0, result.output
+    assert (given, len(at)) == ([], 5)
+    assert all(torch.equal(tensor, at[2][name]) for name, tensor in policy(out).items())
+    assert not torch.equal(at[2]["actor.log_deviation"], at[4]["actor.log_deviation"])
+    record = record_of(out)
+    assert len(record["evaluations"]) == 7
+    assert record["best"] == {"updates": 4, "success": 1.0, "return": 2.0}
+    fresh = evaluate(MAKE, load_policy(out / "policy.pt"), 3, purpose_seed(0, "report"))
+    report = record["report"]
+    assert report["return"] == fresh.mean_return
+    assert report["interval"] == list(fresh.interval)
+    low, high = fresh.interval
+    line = (
+        f"success 0% ({low:.0%} to {high:.0%}) in 3 fresh episodes, return {report['return']:.4g}"
+    )
+    assert f"{line}, 48 environment steps, {report['minutes']:.1f} minutes" in result.output
+    assert record["starts"] == {
+        "undo": [],
+        "selection": episode_seeds(purpose_seed(0, "selection"), 2),
+        "report": list(fresh.seeds),
+    }
+
+
+def test_the_last_policy_is_checked_at_held_out_starts(config, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(Trainer, "check", lambda trainer: calls.append(trainer.updates) or {})
+    held_out = "trainer.held_out=2", "trainer.check_every=2", "updates=3", "viewers=[]"
+    result = call(config, "--out", tmp_path / "out", *(f"--set={change}" for change in held_out))
+    assert result.exit_code == 0, result.output
+    assert calls[-2:] == [2, 3]
+    assert len(record_of(tmp_path / "out")["starts"]["undo"]) == 2
 
 
 def test_a_page_shows_all_episodes_of_the_evaluation(config, tmp_path):
@@ -104,9 +181,7 @@ TRYOUT = ("--set", "tryout={seeds: [0, 1, 2], updates: 2}")
 
 def same_policies(a, b):
     a, b = policy(a), policy(b)
-    return a["counts"] == b["counts"] and all(
-        torch.equal(tensor, b["policy"][name]) for name, tensor in a["policy"].items()
-    )
+    return all(torch.equal(tensor, b[name]) for name, tensor in a.items())
 
 
 @pytest.mark.slow

@@ -23,8 +23,8 @@ from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
 from diffcloth_torch.learn import trainer as trainer_module
 from diffcloth_torch.learn.adam import TensorAdam
-from diffcloth_torch.learn.networks import Actor, Plan
-from diffcloth_torch.learn.rollouts import Policy
+from diffcloth_torch.learn.networks import Actor, Plan, Scale
+from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
 
 HOLD = (0.0, 0.0, 0.1, 0.9, 0.0, 0.0, 0.1, 0.9)
@@ -631,7 +631,7 @@ def test_noise_and_scale_of_a_policy():
     noise = torch.ones(3, 8)
     torch.testing.assert_close(policy(observation, noise).atanh(), quiet.atanh() + 0.2)
     rows = torch.randn(500, 5) * 3 + 2
-    scale = rollouts_module.Scale(5)
+    scale = Scale(5)
     scale.see(rows[:200])
     scale.see(rows[200:])
     torch.testing.assert_close(scale.mean, rows.mean(dim=0))

@@ -79,7 +79,10 @@ PUBLIC = {
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
     "fabrics": "MEASUREMENTS Measurement material",
-    "learn": "Policy Processes Ranks RayActors Trainer TrainerOptions",
+    "learn": (
+        "Episodes Policy PolicySizes Processes Ranks RayActors Trainer TrainerOptions evaluate "
+        "load_policy record"
+    ),
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",

@@ -1,0 +1,357 @@
+"""How well a policy does in episodes from fresh starts, each of which has a seed of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch import cpu
+from diffcloth_torch.checks import (
+    check_choice,
+    check_count,
+    check_shape,
+    float_tensor,
+)
+from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn.policy import Policy, PolicySizes, check_fits
+from diffcloth_torch.learn.rollouts import MakeEnv, environments, threads_of_torch
+from diffcloth_torch.learn.workers import Workers, check_workers, pickled
+from diffcloth_torch.operations import called
+from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.records.state import State
+
+__all__ = [
+    "PURPOSES",
+    "Acts",
+    "Episodes",
+    "Step",
+    "acting",
+    "episode_seeds",
+    "evaluate",
+    "evaluate_starts",
+    "follow",
+    "purpose_seed",
+    "seeds_of",
+    "steps_of",
+]
+
+Acts = Callable[[Tensor], Any] | str
+"""A function of observations [B, O] that returns actions [B, A], or "scripted"."""
+
+PURPOSES = ("undo", "selection", "report")
+"""Uses of starts in a training, which have no start in common."""
+
+_LARGEST_EPISODES = 10**6  # more than of a day
+_CHUNK = 8  # environments that step together
+_LARGEST_SEED = 2**64 - 1
+_SCRIPTED = ("scripted",)
+_ROWS = ("returns", "success", "ever", "failed", "blocked")
+_QUANTILE = 1.959963984540054  # of the normal distribution, for 95 %
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Episodes:
+    """Episodes of a policy.
+
+    The length of it is E, the number of episodes.
+
+    Attributes:
+        returns: Sum of the rewards of each episode, float32 [E].
+        success: Whether the task was done at the end, bool [E].
+        ever: Whether it was done, and held, at any time, bool [E].
+        failed: Whether the simulation failed, which ends an episode, bool [E].
+        blocked: Whether a motion was infeasible, and was not made, bool [E].
+        steps: Environment steps of all episodes.
+        seeds: Of the starts [E]: `env.reset(seed=seeds[:8])` begins the first eight episodes.
+    """
+
+    returns: Tensor
+    success: Tensor
+    ever: Tensor
+    failed: Tensor
+    blocked: Tensor
+    steps: int
+    seeds: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @property
+    def mean_return(self) -> float:
+        """Mean of the returns."""
+        return float(self.returns.mean())
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that succeeded."""
+        return float(self.success.float().mean())
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Confidence interval of the probability of success, 95 %.
+
+        Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", Journal of
+        the American Statistical Association 22 (1927).
+        """
+        n, share = len(self), float(self.success.double().mean())
+        square = _QUANTILE**2 / n
+        middle = (share + square / 2) / (1 + square)
+        half = _QUANTILE / (1 + square) * math.sqrt(share * (1 - share) / n + square / (4 * n))
+        return max(middle - half, 0.0), min(middle + half, 1.0)
+
+    def __repr__(self) -> str:
+        low, high = self.interval
+        counts = ("success", "ever", "failed", "blocked")
+        parts = [f"{name}={int(getattr(self, name).sum())} of {len(self)}" for name in counts]
+        parts[0] += f" ({low:.0%} to {high:.0%})"
+        return record_text(
+            type(self).__name__,
+            [*parts, field_text("mean_return", self.mean_return), field_text("steps", self.steps)],
+        )
+
+
+@called("evaluate")
+def evaluate(
+    make: MakeEnv,
+    policy: Acts,
+    episodes: int = 64,
+    seed: int = 10_000,
+    *,
+    workers: Workers | None = None,
+) -> Episodes:
+    """Follow a policy in episodes from fresh starts.
+
+    Episode i has a start of its own, by the seed and i alone, and the same bits whatever the number
+    of episodes and whoever computes it. What a policy learned from are other starts, unless it was
+    trained from these seeds.
+
+    Args:
+        make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7)`.
+        policy: A function of observations, float32 [1, O], that returns actions [1, A], such as a
+            `Policy`; or "scripted" for the policy of the task made by hand. Policies that remember
+            earlier observations are not accepted: episodes take turns.
+        episodes: E, their number.
+        seed: Of their starts.
+        workers: What computes the episodes; None computes them here. `make` and `policy` must then
+            be such as can be pickled.
+
+    Raises:
+        InvalidInput: If an argument is not accepted, or the actions have another shape.
+    """
+    seeds = seeds_of("evaluate", seed, episodes)
+    return evaluate_starts("evaluate", make, policy, seeds, workers=workers)
+
+
+def seeds_of(owner: str, seed: int, episodes: int) -> list[int]:
+    """The seeds of the starts of episodes, of checked arguments."""
+    check_count(f"{owner}: `episodes`", episodes, 1, _LARGEST_EPISODES)
+    check_count(f"{owner}: `seed`", seed, 0, _LARGEST_SEED)
+    return episode_seeds(seed, episodes)
+
+
+def episode_seeds(seed: int, episodes: int) -> list[int]:
+    """A seed for each episode, of which the first ones do not depend on the number."""
+    sequences = [np.random.SeedSequence(seed, spawn_key=(i,)) for i in range(episodes)]
+    return [int(s.generate_state(1, np.uint64)[0]) for s in sequences]
+
+
+def purpose_seed(seed: int, purpose: str) -> int:
+    """The seed of the starts of one of `PURPOSES`, by the seed of a training."""
+    # Seeds of `Trainer` for its own starts have no spawn key.
+    sequence = np.random.SeedSequence(seed, spawn_key=(PURPOSES.index(purpose),))
+    return int(sequence.generate_state(1, np.uint64)[0])
+
+
+def evaluate_starts(
+    owner: str,
+    make: MakeEnv,
+    policy: Acts,
+    seeds: Sequence[int],
+    *,
+    workers: Workers | None = None,
+    note: Note | None = None,
+) -> Episodes:
+    """Follow a policy from starts by their seeds; see `evaluate`.
+
+    Args:
+        owner: Opens messages.
+        make: As for `evaluate`.
+        policy: Likewise.
+        seeds: Of the starts, one for each episode.
+        workers: As for `evaluate`.
+        note: Called with the environments, the seeds and the steps of each chunk; not with
+            `workers`.
+    """
+    if not callable(make):
+        raise TypeError(f"{owner}: `make` must be a function that makes environments, got {make!r}")
+    given: object = policy
+    if isinstance(given, str):
+        check_choice(f"{owner}: `policy`", given, _SCRIPTED)
+    elif not callable(given) or isinstance(given, type):
+        raise TypeError(
+            f'{owner}: `policy` must be a function of observations, or "scripted", got {policy!r}'
+        )
+    check_workers(f"{owner}: `workers`", workers)
+    chunks = [tuple(seeds[k : k + _CHUNK]) for k in range(0, len(seeds), _CHUNK)]
+    if workers is None:
+        made: dict[int, ClothVectorEnv] = {}
+        found = []
+        for chunk in chunks:
+            if len(chunk) not in made:
+                made[len(chunk)] = make(num_envs=len(chunk))
+            found.append(_rows(owner, made[len(chunk)], policy, chunk, note))
+    else:
+        make_env = pickled(f"{owner}: with `workers`, `make`", make)
+        pickled(f"{owner}: with `workers`, `policy`", policy)
+        found = list(workers.map(_rows_remotely, [(owner, make_env, policy, c) for c in chunks]))
+    return Episodes(
+        **{name: torch.cat([each[name] for each in found]) for name in _ROWS},
+        steps=sum(int(each["lengths"].sum()) for each in found),
+        seeds=tuple(seeds),
+    )
+
+
+def follow(
+    env: ClothVectorEnv, act: Callable[[Tensor], Tensor], seed: int | Sequence[int]
+) -> tuple[Tensor, Tensor, list[State]]:
+    """Follow actions from starts, and keep the states.
+
+    Args:
+        env: Environments, which are reset.
+        act: Actions [B, A] for observations [B, O].
+        seed: Of the reset.
+
+    Returns:
+        Returns [B], successes [B], and the states of all episodes until the first of them ends.
+    """
+    observation, _ = env.reset(seed=seed)
+    total = cpu.zeros(env.num_envs, dtype=torch.float32)
+    success = cpu.zeros(env.num_envs, dtype=torch.bool)
+    states = [env.env_state.state]
+    for step in steps_of(env, act, observation):
+        total += torch.where(step.running, step.reward, 0.0)
+        success = torch.where(step.running, step.flags["success"], success)
+        if bool(step.goes_on.all()):
+            states.append(env.env_state.state)
+    return total, success, states
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A transition of all environments.
+
+    Attributes:
+        seen: Observations before it [B, O].
+        actions: [B, A].
+        reward: [B].
+        after: Observations after it, before a new start [B, O].
+        terminated: Whether it ended an episode before the horizon [B].
+        truncated: Whether the horizon ended it [B].
+        flags: "success", "failed" and "blocked" after it, before a new start, [B] each.
+        running: Whether the first episode of an environment was not over before it [B].
+    """
+
+    seen: Tensor
+    actions: Tensor
+    reward: Tensor
+    after: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    flags: dict[str, Tensor]
+    running: Tensor
+
+    @property
+    def goes_on(self) -> Tensor:
+        """Whether the first episode of an environment is not over after it [B]."""
+        return self.running & ~(self.terminated | self.truncated)
+
+
+Note = Callable[[ClothVectorEnv, tuple[int, ...], list[Step]], None]
+
+
+def steps_of(
+    env: ClothVectorEnv, act: Callable[[Tensor], Tensor], observation: Tensor
+) -> Iterator[Step]:
+    """Follow actions until each environment has ended an episode.
+
+    Args:
+        env: Environments at the start of their episodes.
+        act: Actions [B, A] for observations [B, O].
+        observation: The first one, of `env.reset`.
+    """
+    running = cpu.ones(env.num_envs, dtype=torch.bool)
+    while bool(running.any()):
+        with torch.no_grad():
+            actions = act(observation)
+            following, reward, terminated, truncated, info = env.step(actions)
+        flags = info.get("final_info", info)
+        after = info["obs_before_reset"]
+        step = Step(observation, actions, reward, after, terminated, truncated, flags, running)
+        yield step
+        observation, running = following, step.goes_on
+
+
+def acting(owner: str, env: ClothVectorEnv, policy: Acts) -> Callable[[Tensor], Tensor]:
+    """Actions [B, A] by a policy for observations [B, O] of environments, checked.
+
+    The policy computes one row at a time, as products of matrices round by their number of rows.
+    """
+    if isinstance(policy, str):
+        return lambda _: env.scripted_actions()
+    if isinstance(policy, Policy):
+        check_fits(f"{owner}: `policy`", policy, PolicySizes.of(env))
+    function: Callable[[Tensor], Any] = policy
+
+    def act(observation: Tensor) -> Tensor:
+        name = f"{owner}: the actions of `policy`"
+        rows = [float_tensor(name, function(row[None])) for row in observation]
+        for row in rows:
+            check_shape(name, row.shape, [(1, env.task.action_size)])
+        actions = torch.cat(rows)
+        if not bool(torch.isfinite(actions).all()):
+            raise InvalidInput(f"{name} must be finite, got {actions.tolist()}")
+        return actions
+
+    return act
+
+
+def _rows(
+    owner: str,
+    env: ClothVectorEnv,
+    policy: Acts,
+    seeds: tuple[int, ...],
+    note: Note | None = None,
+) -> dict[str, Tensor]:
+    """The rows of `Episodes`, and the lengths of the episodes."""
+    count = len(seeds)
+    rows = {name: cpu.zeros(count, dtype=torch.bool) for name in _ROWS}
+    rows["returns"] = cpu.zeros(count, dtype=torch.float32)
+    rows["lengths"] = cpu.zeros(count, dtype=torch.int64)
+    steps: list[Step] = []
+    with threads_of_torch(1):
+        observation, _ = env.reset(seed=seeds)
+        for step in steps_of(env, acting(owner, env, policy), observation):
+            running, flags = step.running, step.flags
+            rows["returns"] += torch.where(running, step.reward, 0.0)
+            rows["lengths"] += running
+            rows["success"] = torch.where(running, flags["success"], rows["success"])
+            rows["ever"] |= running & flags["success"]
+            for name in ("failed", "blocked"):
+                rows[name] |= running & flags[name]
+            if note is not None:
+                steps.append(step)
+    if note is not None:
+        note(env, seeds, steps)
+    return rows
+
+
+def _rows_remotely(work: tuple[str, bytes, Acts, tuple[int, ...]]) -> dict[str, Tensor]:
+    owner, make_env, policy, seeds = work
+    return _rows(owner, environments(make_env, len(seeds)), policy, seeds)
