@@ -15,8 +15,10 @@ __all__ = [
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
+    "MeshBiasWarning",
     "NotConverged",
     "SimulationError",
+    "StepBiasWarning",
     "TurnedTooFar",
     "WorkerError",
 ]
@@ -82,6 +84,14 @@ class AddedMassWarning(UserWarning):
 
 class BarrierStartWarning(UserWarning):
     """Surfaces start so deep in the barrier that it throws them apart; the message names them."""
+
+
+class StepBiasWarning(UserWarning):
+    """The time step shifts fitted numbers by more than the half width of their intervals."""
+
+
+class MeshBiasWarning(UserWarning):
+    """The mesh shifts fitted numbers by more than the half width of their intervals."""
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:

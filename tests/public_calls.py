@@ -246,19 +246,23 @@ class World:
     def found(self):
         return self.descent()
 
-    @property
-    def fitting(self):
+    @cached_property
+    def residual(self):
         seen = self.states.positions
 
         def residual(values):
             states = self.hung.rollout(self.hung.initial_state(), parameters=values, steps=3)
             return residuals.markers(states, seen, noise=1e-3)
 
+        return residual
+
+    @property
+    def fitting(self):
         free = {
             "stretch": dc.Variable(500.0, scale="log"),
             "gravity": dc.Variable([0.0, 0.0, -9.0]),
         }
-        return call(dc.fit, free, residual, max_evaluations=3)
+        return call(dc.fit, free, self.residual, max_evaluations=3)
 
     @cached_property
     def fit(self):
@@ -334,6 +338,8 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "Evaluation.is_better_than": lambda w: call(w.found.best.is_better_than, w.found.first),
     "Evaluation.record": lambda w: call(w.found.best.record),
     "Fit": lambda w: record(dc.Fit, w.fit),
+    "Fit.mesh_bias": lambda w: call(w.fit.mesh_bias, w.residual, order=2.0),
+    "Fit.step_bias": lambda w: call(w.fit.step_bias, w.residual, max_evaluations=1),
     "Fit.report": lambda w: call(w.fit.report, w.folder / "fit.html"),
     "Material": lambda w: call(dc.Material, 100.0, 1e-5, 0.3, density=0.2, stretch_weft=90.0),
     "Material.per_face": lambda w: call(dc.Material().per_face, "stretch"),
@@ -514,6 +520,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "learn.TrainerOptions": lambda w: call(dc.learn.TrainerOptions, "apg", 4),
     "learn.TrainerOptions.rate_share": lambda w: call(dc.learn.TrainerOptions().rate_share, 3),
     "robots.panda": lambda w: call(dc.robots.panda),
+    "residuals.extrapolated": lambda w: call(
+        residuals.extrapolated, w.residual, w.residual, ratio=2.0
+    ),
     "residuals.markers": lambda w: call(
         residuals.markers, w.states, np.zeros((3, 12, 3)), np.ones((3, 12)), noise=0.1
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -26,6 +26,7 @@ from diffcloth_torch.sim.records.state import State, check_state
 
 __all__ = [
     "Comparison",
+    "blocks_of",
     "check_count_of",
     "checked_noise",
     "checked_points",
@@ -78,6 +79,26 @@ def note(comparison: Comparison) -> None:
     notes = _NOTES.get()
     if notes is not None:
         notes.append(comparison)
+
+
+def blocks_of(owner: str, found: object) -> dict[str, Tensor]:
+    """The blocks that a residual function returned: name -> tensor, whose first axis is time.
+
+    Raises:
+        TypeError: If it returned something else than a tensor, a list of tensors, or a dict of
+            name -> tensor.
+    """
+    if isinstance(found, Tensor):
+        return {"residuals": found}
+    if isinstance(found, list | tuple):
+        found = {f"trajectory {k}": part for k, part in enumerate(found)}
+    if not isinstance(found, Mapping) or not all(
+        isinstance(name, str) and isinstance(part, Tensor) for name, part in found.items()
+    ):
+        raise TypeError(
+            f"{owner} must return a tensor, a list of tensors, or a dict of name -> tensor"
+        )
+    return dict(found)
 
 
 def positions_of(owner: str, states: Sequence[State]) -> Tensor:

@@ -29,16 +29,18 @@ from diffcloth_torch.checks import (
     check_number,
     refuse_threads,
 )
-from diffcloth_torch.errors import InvalidInput, warn_caller
+from diffcloth_torch.errors import InvalidInput, MeshBiasWarning, StepBiasWarning, warn_caller
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import as_path
 from diffcloth_torch.lock import locked
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.bias import factor_of, limit_of, moves_of
 from diffcloth_torch.optimize.fit_page import Page, write_page
+from diffcloth_torch.optimize.linearized import Linearized
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, parameters_of, trajectories
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
-from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of
+from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of, weights_of
 from diffcloth_torch.optimize.variables import Space, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
@@ -75,6 +77,7 @@ class Fit:
             simulation fails there.
         history: All evaluations, start after start.
         compared: The residuals of the last stage, and those kept out, for the report.
+        linearized: Residuals of the last stage to first order in the fitted numbers.
     """
 
     parameters: Parameters
@@ -93,11 +96,108 @@ class Fit:
     held_out: list[float]
     history: list[Trial] = field(repr=False)
     compared: list[Residuals] = field(repr=False)
+    linearized: Linearized = field(repr=False)
 
     @property
     def failures(self) -> int:
         """Number of trial steps that were rejected."""
         return sum(bool(trial.failure) for trial in self.history)
+
+    def step_bias(
+        self, finer: Residuals, ratio: float = 2.0, *, max_evaluations: int = 4
+    ) -> dict[str, Tensor]:
+        """Estimate how far the time step h shifts the fitted numbers.
+
+        With residuals r of the fit and f of the time step h / ratio, residuals in the limit h = 0
+        are r + (f - r) ratio / (ratio - 1) to first order in h. The least squares of these lie
+        -(J^T J + P^2)^-1 J^T (f - r) ratio / (ratio - 1) from the solution, with the Jacobian J
+        and the precisions P of the priors. Where this step is not small beside the intervals, both
+        residuals are evaluated again behind it, with the same Jacobian.
+        See `residuals.extrapolated` for the motions to which this applies.
+
+        Args:
+            finer: The residuals of the last stage, from a simulation with the time step h / ratio.
+            ratio: Ratio of the two time steps, > 1.
+            max_evaluations: Of `finer`, >= 1; one suffices where the bias is small.
+
+        Returns:
+            Name of each free variable -> limit minus value, so that value plus shift is the fit of
+            extrapolated residuals. Numbers at a bound do not move.
+
+        Raises:
+            InvalidInput: If `finer` returns other residuals, or an argument is not accepted.
+            SimulationError: If the simulation fails.
+
+        Warns:
+            StepBiasWarning: If a shift exceeds the half width of the interval of its number.
+        """
+        owner = "Fit.step_bias"
+        factor = factor_of(owner, ratio, 1.0)
+        return self._bias(owner, finer, factor, max_evaluations, "time step", StepBiasWarning)
+
+    def mesh_bias(
+        self,
+        finer: Residuals,
+        ratio: float = 2.0,
+        *,
+        order: float = 2.0,
+        max_evaluations: int = 4,
+    ) -> dict[str, Tensor]:
+        """Estimate how far the mesh shifts the fitted numbers, as `step_bias`.
+
+        Args:
+            finer: The residuals of the last stage, from a mesh whose edges are shorter by `ratio`;
+                its markers are the same material points in the same order.
+            ratio: Ratio of the edge lengths, > 1.
+            order: Power of the edge length in the error of positions, > 0: about 2 where the cloth
+                is resolved; 1 where a boundary moves with the mesh, as beside a clamp.
+            max_evaluations: As that of `step_bias`.
+
+        Returns:
+            Name of each free variable -> limit minus value.
+
+        Raises:
+            InvalidInput: If `finer` returns other residuals, or an argument is not accepted.
+            SimulationError: If the simulation fails.
+
+        Warns:
+            MeshBiasWarning: If a shift exceeds the half width of the interval of its number.
+        """
+        owner = "Fit.mesh_bias"
+        factor = factor_of(owner, ratio, order)
+        return self._bias(owner, finer, factor, max_evaluations, "mesh", MeshBiasWarning)
+
+    def _bias(
+        self,
+        owner: str,
+        finer: Residuals,
+        factor: float,
+        max_evaluations: int,
+        source: str,
+        category: type[Warning],
+    ) -> dict[str, Tensor]:
+        check_count(f"{owner}: `max_evaluations`", max_evaluations, 1)
+        model = self.linearized
+        limit = limit_of(owner, model, self.compared[0], finer, factor, max_evaluations)
+        moved = moves_of(model, limit.theta)
+        unsettled = max_evaluations > 1 and limit.last_step > 1.0
+        if moved or unsettled:
+            parts = [
+                f"{owner}: without the error of the {source} the fit would find {moved}"
+                if moved
+                else f"{owner}: the bias of the {source} is not known"
+            ]
+            if unsettled:
+                parts.append(
+                    f"the last of {max_evaluations} steps to the limit moved a number by "
+                    f"{limit.last_step:.2g} half widths of its interval"
+                )
+            if self.at_bounds:
+                parts.append(f"at bounds, and not moved: {', '.join(self.at_bounds)}")
+            parts.append("the intervals do not contain this bias: take a finer simulation")
+            warn_caller("; ".join(parts), category)
+        values = model.space.values(torch.from_numpy(limit.theta))
+        return {name: values[name] - self.values[name] for name in model.space.variables}
 
     def report(self, path: str | Path) -> None:
         """Write a page that shows the fit: one file, which loads nothing.
@@ -162,10 +262,11 @@ def fit(
         variables: Name -> variable. Names of fields of `Parameters` become that; others reach
             `residuals` as a second argument.
         residuals: Function of a `Parameters` that holds the variables, and of name -> value of the
-            other variables if there are some; returns a tensor [M], or a list of tensors, one for
-            each trajectory: see `dc.residuals`. It is called with tensors that are being
-            differentiated, and must return the same values for the same input. Or a list of
-            `Stage`, run one after the other; the last one must free all variables.
+            other variables if there are some; returns a tensor, or a list of tensors, one for
+            each trajectory, or a dict of name -> tensor: see `dc.residuals`. It is called with
+            tensors that are being differentiated, and must return the same values for the same
+            input. Or a list of `Stage`, run one after the other; the last one must free all
+            variables.
         method: The solver. "least_squares" is SciPy's trust region, with Jacobians. "L-BFGS-B" is
             SciPy's, with gradients, for many variables. A function that makes an optimizer of
             torch, as `partial(torch.optim.Adam, lr=0.05)`, takes `max_evaluations` steps of
@@ -197,7 +298,7 @@ def fit(
     Raises:
         InvalidInput: If an argument is not accepted.
         SimulationError: If the simulation fails at the first values of every start.
-        TypeError: If `residuals` returns something else than tensors.
+        TypeError: If `residuals` returns something else.
         WorkerError: If the processes of a start die, or miss the deadline, again and again.
     """
     from_extra("scipy", "fit", "fit: it needs SciPy")
@@ -233,6 +334,14 @@ def fit(
     at_bounds = space.at_bounds(best.theta)
     _warn_of_bounds(variables, space, at_bounds)
     values = space.values(torch.from_numpy(np.array(best.theta)))
+    linearized = Linearized(
+        space=space,
+        theta=best.theta,
+        residuals=best.residuals,
+        jacobian=best.jacobian,
+        weights=weights_of(best.residuals, loss, job.options.loss_scale)[0],
+        half_widths=found.half_widths,
+    )
     return Fit(
         parameters=parameters_of(values),
         values=values,
@@ -250,6 +359,7 @@ def fit(
         held_out=[] if hold_out is None else _errors(hold_out, values),
         history=[trial for end in ends for trial in end.history],
         compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
+        linearized=linearized,
     )
 
 

@@ -25,6 +25,7 @@ from diffcloth_torch.checkpoint import (
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.compared import blocks_of
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.sim.records.controls import Parameters
 
@@ -41,7 +42,7 @@ __all__ = [
 
 _CHECKPOINT = "fit"  # kind of the files of evaluations
 
-Residuals = Callable[..., Tensor | Sequence[Tensor]]
+Residuals = Callable[..., Tensor | Sequence[Tensor] | Mapping[str, Tensor]]
 
 Failure = SimulationError | InadmissibleMaterial
 FAILURES = (SimulationError, InadmissibleMaterial)
@@ -332,10 +333,7 @@ def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Ten
     others = {n: v for n, v in values.items() if n not in PARAMETERS}
     parameters = parameters_of(values)
     found = residuals(parameters, others) if others else residuals(parameters)
-    parts = [found] if isinstance(found, Tensor) else found
-    if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
-        raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
-    return list(parts)
+    return list(blocks_of("fit: `residuals`", found).values())
 
 
 def _has_tangent(part: Tensor) -> bool:

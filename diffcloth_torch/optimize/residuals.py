@@ -28,10 +28,11 @@ from diffcloth_torch.optimize.compared import (
     positions_of,
     times_of,
 )
+from diffcloth_torch.optimize.extrapolation import extrapolated
 from diffcloth_torch.optimize.outlines import outline
 from diffcloth_torch.sim.records.state import State
 
-__all__ = ["markers", "outline", "point_cloud"]
+__all__ = ["extrapolated", "markers", "outline", "point_cloud"]
 
 
 def markers(

@@ -10,7 +10,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.optimize.variables import Space
 
-__all__ = ["Direction", "Noise", "Uncertainty", "noise_of", "uncertainty_of"]
+__all__ = ["Direction", "Noise", "Uncertainty", "noise_of", "uncertainty_of", "weights_of"]
 
 # Standard error of a direction, in sizes of its variables, from which on it is not known at all.
 _UNSURE = 1.0
@@ -46,6 +46,7 @@ class Uncertainty(NamedTuple):
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
         deviations: Standard error of each theta [p].
+        half_widths: Half widths of the intervals of theta [p].
     """
 
     covariance: FloatArray
@@ -53,6 +54,7 @@ class Uncertainty(NamedTuple):
     intervals: dict[str, tuple[float, float]]
     unidentifiable: list[Direction]
     deviations: FloatArray
+    half_widths: FloatArray
 
 
 class Noise(NamedTuple):
@@ -77,13 +79,17 @@ def noise_of(residuals: FloatArray, numbers: int, loss: str, scale: float) -> No
     freedom = len(residuals) - numbers
     if freedom < 1:
         return Noise(1.0, np.inf)
-    influence, slope = _influence(residuals, loss, scale)
+    weights, slope = weights_of(residuals, loss, scale)
+    influence = weights * residuals
     deviation = np.sqrt(float(influence @ influence) / freedom) / max(float(slope.mean()), _TINY)
     return Noise(float(deviation), freedom)
 
 
-def _influence(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
-    """Half the derivative of each square's loss, as SciPy has it, and its own derivative."""
+def weights_of(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Weights w of residuals r in the gradient of the cost, w r, and the derivatives of w r by r.
+
+    The losses are those of SciPy.
+    """
     z = np.square(residuals / scale)
     if loss == "linear":
         first, second = np.ones_like(z), np.zeros_like(z)
@@ -96,7 +102,7 @@ def _influence(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArr
         first, second = 1 / (1 + z), -1 / np.square(1 + z)
     else:
         first, second = 1 / (1 + z * z), -2 * z / np.square(1 + z * z)
-    return first * residuals, first + 2 * z * second
+    return first, first + 2 * z * second
 
 
 def uncertainty_of(
@@ -118,13 +124,14 @@ def uncertainty_of(
     rates = space.rates(theta)
     covariance = rates[:, None] * of_theta * rates
     deviations = np.sqrt(np.diag(covariance))
-    reach = _reach(found.freedom)
+    half_widths = _reach(found.freedom) * np.sqrt(np.diag(of_theta))
     return Uncertainty(
         covariance=covariance,
         correlation=_correlation(covariance, deviations),
-        intervals=_intervals(space, theta, reach * np.sqrt(np.diag(of_theta))),
+        intervals=_intervals(space, theta, half_widths),
         unidentifiable=_directions(space.names, jacobian * units, noise),
         deviations=np.sqrt(np.diag(of_theta)),
+        half_widths=half_widths,
     )
 
 
