@@ -11,11 +11,14 @@ from typing import Any
 __all__ = [
     "AddedMassWarning",
     "BarrierStartWarning",
+    "CorrelatedResidualsWarning",
     "InadmissibleMaterial",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
     "MeshBiasWarning",
+    "ModelErrorWarning",
+    "NoiseWarning",
     "NotConverged",
     "SimulationError",
     "StepBiasWarning",
@@ -92,6 +95,18 @@ class StepBiasWarning(UserWarning):
 
 class MeshBiasWarning(UserWarning):
     """The mesh shifts fitted numbers by more than the half width of their intervals."""
+
+
+class ModelErrorWarning(UserWarning):
+    """Residuals of a fit are too large for their noise: its intervals need not hold the truth."""
+
+
+class NoiseWarning(UserWarning):
+    """Residuals of a fit are too small for the noise that was given."""
+
+
+class CorrelatedResidualsWarning(UserWarning):
+    """Residuals of a fit are correlated along their series, and its intervals account for it."""
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:

@@ -104,6 +104,7 @@ def _run(task: Identify, out: Path) -> str:
         for name, shifts in (bias or {}).items()
     ]
     lines += [f"cannot be told apart: {direction}" for direction in found.unidentifiable]
+    lines += [f"nearly collinear: {pair}" for pair in found.collinear]
     lines += [f"start {k}: {start.apart}" for k, start in enumerate(found.starts) if start.apart]
     return "\n".join([*lines, f"{len(found.history)} evaluations; results are in {out}"])
 
@@ -127,6 +128,13 @@ def _record(task: Identify, found: Fit) -> dict[str, Any]:
         "intervals": {n: [*map(finite_or_none, ends)] for n, ends in found.intervals.items()},
         "covariance": [[*map(finite_or_none, row)] for row in found.covariance.tolist()],
         "unidentifiable": [str(direction) for direction in found.unidentifiable],
+        "collinear": [str(pair) for pair in found.collinear],
+        "noise_model": found.noise_model,
+        "rms": found.rms,
+        "blocks": {
+            name: {key: finite_or_none(value) for key, value in vars(block).items()}
+            for name, block in found.blocks.items()
+        },
         "held_out": found.held_out,
         "starts": [
             {

@@ -103,6 +103,7 @@ class FitSection(Section):
     loss_scale: Positive = 1.0
     max_evaluations: Updates = 100
     tolerance: Positive = 1e-8
+    covariance: Literal["auto", "white", "robust"] = "auto"
     extrapolate: bool = False
     step_check: bool = True
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.autograd.transforms import numbers_of
@@ -49,6 +50,7 @@ class Comparison:
         placed: The observed ones beside the states: an outline that was turned lies as they do.
         labels: Name of each point of a frame: its vertex, direction or number.
         noise: Standard deviation of an observation [m].
+        used: Of markers, coordinates that have a residual, shape [T, n, 3]; else None.
     """
 
     kind: str
@@ -58,6 +60,7 @@ class Comparison:
     placed: list[FloatArray]
     labels: list[str]
     noise: float
+    used: NDArray[np.bool_] | None = None
 
 
 _NOTES: ContextVar[list[Comparison] | None] = ContextVar("_NOTES", default=None)

@@ -14,7 +14,7 @@ from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -38,15 +38,28 @@ from diffcloth_torch.optimize.bias import factor_of, limit_of, moves_of
 from diffcloth_torch.optimize.fit_page import Page, write_page
 from diffcloth_torch.optimize.linearized import Linearized
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
+from diffcloth_torch.optimize.misfit import Block, are_correlated, blocks_of_fit, warn_of_blocks
 from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, parameters_of, trajectories
+from diffcloth_torch.optimize.series import Layout, is_walk, stretches, walk
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
-from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of, weights_of
+from diffcloth_torch.optimize.uncertainty import (
+    Collinear,
+    Direction,
+    Noise,
+    Spread,
+    leverages,
+    noise_of,
+    uncertainty_of,
+    weights_of,
+)
 from diffcloth_torch.optimize.variables import Space, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
 
-__all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
+__all__ = ["Block", "Collinear", "Direction", "Fit", "Stage", "Start", "Trial", "fit"]
 
+_TINY = 1e-300
+_COVARIANCES = ("auto", "white", "robust")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 
 
@@ -66,6 +79,10 @@ class Fit:
         correlation: Likewise.
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
+        collinear: Numbers that would be known ten times better if another were known.
+        blocks: Name of each block of residuals -> their size beside their noise.
+        noise_model: Noise that the covariance assumes: "white noise", "correlated stretches" or
+            "random walks".
         residuals: At the solution [M], of the last stage, without priors.
         cost: Half the sum of their squares and of those of the priors.
         success: Whether the solver converged.
@@ -87,6 +104,9 @@ class Fit:
     correlation: FloatArray
     intervals: dict[str, tuple[float, float]]
     unidentifiable: list[Direction]
+    collinear: list[Collinear]
+    blocks: dict[str, Block]
+    noise_model: str
     residuals: FloatArray
     cost: float
     success: bool
@@ -97,6 +117,16 @@ class Fit:
     history: list[Trial] = field(repr=False)
     compared: list[Residuals] = field(repr=False)
     linearized: Linearized = field(repr=False)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals: about one if the model is right, in known noise."""
+        return float(np.sqrt(np.square(self.residuals).mean()))
+
+    @property
+    def chi2(self) -> dict[str, float]:
+        """Sum of squares of each block of residuals; `blocks` has its expected value."""
+        return {name: block.chi2 for name, block in self.blocks.items()}
 
     @property
     def failures(self) -> int:
@@ -226,7 +256,10 @@ class Fit:
                 intervals=self.intervals,
                 correlation=self.correlation,
                 unidentifiable=[str(direction) for direction in self.unidentifiable],
-                rms=float(np.sqrt(np.square(self.residuals).mean())),
+                collinear=[str(pair) for pair in self.collinear],
+                blocks=self.blocks,
+                noise_model=self.noise_model,
+                rms=self.rms,
                 message=self.message,
                 starts=self.starts,
                 history=self.history,
@@ -247,6 +280,7 @@ def fit(
     loss_scale: float = 1.0,
     max_evaluations: int = 100,
     tolerance: float = 1e-8,
+    covariance: Literal["auto", "white", "robust"] = "auto",
     hold_out: Residuals | None = None,
     workers: int | Executor = 0,
     deadline: float = DEADLINE,
@@ -278,6 +312,11 @@ def fit(
         loss_scale: Residual from which on the others count less, > 0.
         max_evaluations: Of the residuals, for each stage of each start.
         tolerance: Relative change of the cost or the variables at which a stage ends.
+        covariance: Noise that the intervals assume. "white" takes residuals as independent of each
+            other. "robust" accounts for correlation along series, which are the first axis of each
+            tensor, or the markers of `residuals.markers`: from stretches of the series, and where
+            these are short beside the correlation, as a random walk. "auto" takes "robust" where
+            residuals are correlated, and warns.
         hold_out: Residuals of trajectories that are kept out of the fit, as `residuals`.
         workers: Number of processes for the starts, 0 for none, or an executor of processes. The
             result has the same bits for any number. `residuals` must then be a function of a module
@@ -300,8 +339,14 @@ def fit(
         SimulationError: If the simulation fails at the first values of every start.
         TypeError: If `residuals` returns something else.
         WorkerError: If the processes of a start die, or miss the deadline, again and again.
+
+    Warns:
+        ModelErrorWarning: If residuals are too large for their noise.
+        NoiseWarning: If they are too small for it.
+        CorrelatedResidualsWarning: If they are correlated, and the covariance accounts for it.
     """
     from_extra("scipy", "fit", "fit: it needs SciPy")
+    check_choice("fit: `covariance`", covariance, _COVARIANCES)
     check_count("fit: `starts`", starts, 1)
     check_count("fit: `seed`", seed, 0)
     refuse_threads("fit: `workers`", workers)
@@ -330,7 +375,18 @@ def fit(
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
     noise = noise_of(best.residuals, len(space), loss, job.options.loss_scale)
-    found = uncertainty_of(space, best.theta, best.jacobian, noise)
+    assert best.layout is not None  # it has residuals
+    # Where a solver has stopped early, residuals show the way that is left, and no noise.
+    correlated = best.success and are_correlated(best.residuals, best.layout)
+    noise_model, spread = "white noise", None
+    if covariance == "robust" or (covariance == "auto" and correlated):
+        influence = _influence(best.residuals, loss, job.options.loss_scale)
+        noise_model, spread, noise = _robust(influence, best.layout, noise, len(space))
+    found = uncertainty_of(space, best.theta, best.jacobian, noise, spread)
+    leverage = leverages(space, best.theta, best.jacobian)
+    blocks = blocks_of_fit(best.residuals, best.layout, leverage, loss)
+    if best.success:
+        warn_of_blocks(blocks, noise_model, correlated=correlated)
     at_bounds = space.at_bounds(best.theta)
     _warn_of_bounds(variables, space, at_bounds)
     values = space.values(torch.from_numpy(np.array(best.theta)))
@@ -350,6 +406,9 @@ def fit(
         correlation=found.correlation,
         intervals=found.intervals,
         unidentifiable=found.unidentifiable,
+        collinear=found.collinear,
+        blocks=blocks,
+        noise_model=noise_model,
         residuals=best.residuals,
         cost=best.cost,
         success=best.success,
@@ -361,6 +420,23 @@ def fit(
         compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
         linearized=linearized,
     )
+
+
+def _influence(residuals: FloatArray, loss: str, scale: float) -> FloatArray:
+    """Residuals as they act on the fit: themselves, unless the loss is robust."""
+    weights, slopes = weights_of(residuals, loss, scale)
+    influence: FloatArray = weights * residuals / max(float(slopes.mean()), _TINY)
+    return influence
+
+
+def _robust(
+    influence: FloatArray, layout: Layout, noise: Noise, numbers: int
+) -> tuple[str, Spread, Noise]:
+    """Covariance of correlated residuals: its name, its spread, and the freedom of its noise."""
+    if is_walk(influence, layout, numbers):
+        return "random walks", lambda u: walk(influence, layout, u), noise
+    spread, count = stretches(influence, layout, numbers)
+    return "correlated stretches", spread, noise._replace(freedom=max(count - 1.0, 1.0))
 
 
 def _options(

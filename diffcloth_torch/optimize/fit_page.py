@@ -18,6 +18,7 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import replace_file
 from diffcloth_torch.optimize.compared import Comparison, noting
+from diffcloth_torch.optimize.misfit import Block
 from diffcloth_torch.optimize.problem import Residuals, Trial, trajectories
 from diffcloth_torch.optimize.starts import Start
 
@@ -45,6 +46,9 @@ class Page:
     intervals: Mapping[str, tuple[float, float]]
     correlation: FloatArray
     unidentifiable: list[str]
+    collinear: list[str]
+    blocks: Mapping[str, Block]
+    noise_model: str
     rms: float
     message: str
     starts: Sequence[Start]
@@ -63,7 +67,11 @@ def write_page(path: Path, page: Page) -> None:
         f"{sum(bool(trial.failure) for trial in page.history)} of which failed.</p>",
         "<h2>Values</h2>",
         _values(page),
+        f"<p>The intervals are those of {page.noise_model}.</p>",
         *[f"<p>Cannot be told apart: {html.escape(text)}.</p>" for text in page.unidentifiable],
+        *[f"<p>Nearly collinear: {html.escape(text)}.</p>" for text in page.collinear],
+        "<h2>Residuals</h2>",
+        _blocks(page),
     ]
     if len(page.names) > 1:
         parts += ["<h2>Correlation</h2>", _correlation(page)]
@@ -102,6 +110,23 @@ def _values(page: Page) -> str:
         for name, a, b in zip(page.names, first, last, strict=True)
     ]
     return _table(["", "first", "found", "interval of 95 %"], rows)
+
+
+def _blocks(page: Page) -> str:
+    head = ["", "number", "root mean square", "chi2", "expected", "p-value", "autocorrelation"]
+    rows = [
+        [
+            name,
+            str(block.count),
+            f"{block.rms:.3g}",
+            f"{block.chi2:.4g}",
+            f"{block.freedom:.4g}",
+            "not known" if np.isnan(block.p_value) else f"{block.p_value:.2g}",
+            f"{block.autocorrelation:+.2f}",
+        ]
+        for name, block in page.blocks.items()
+    ]
+    return _table(head, rows)
 
 
 def _numbers(values: Mapping[str, Tensor], names: Sequence[str]) -> list[float]:

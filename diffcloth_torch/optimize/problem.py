@@ -25,7 +25,8 @@ from diffcloth_torch.checkpoint import (
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
-from diffcloth_torch.optimize.compared import blocks_of
+from diffcloth_torch.optimize.compared import blocks_of, noting
+from diffcloth_torch.optimize.series import Layout, layout_of
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.sim.records.controls import Parameters
 
@@ -36,6 +37,7 @@ __all__ = [
     "Problem",
     "Residuals",
     "Trial",
+    "blocks_at",
     "parameters_of",
     "trajectories",
 ]
@@ -157,6 +159,7 @@ class Problem:
         self._known = torch.from_numpy(np.flatnonzero(space.precisions[rows]))
         self._means = torch.from_numpy(space.means[rows])[self._known]
         self._precisions = torch.from_numpy(space.precisions[rows])[self._known]
+        self.layout: Layout | None = None
         self._last: tuple[bytes, FloatArray | Failure] | None = None
 
     @property
@@ -293,8 +296,11 @@ class Problem:
             )
 
     def _call(self, theta: Tensor) -> Tensor:
-        parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
-        return self._with_priors(parts, theta)
+        with noting() as compared:
+            blocks = blocks_at(self._residuals, self._space.values(self._whole(theta)))
+        if self.layout is None:
+            self.layout = layout_of(blocks, compared)
+        return self._with_priors(list(blocks.values()), theta)
 
     def _differentiated(self, theta: Tensor, *, backward: bool) -> Tensor:
         """The same, where a derivative is wanted; refuses residuals that have none."""
@@ -330,10 +336,15 @@ def parameters_of(values: Mapping[str, Tensor]) -> Parameters:
 
 def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Tensor]:
     """The residuals of each trajectory, at values of all variables."""
+    return list(blocks_at(residuals, values).values())
+
+
+def blocks_at(residuals: Residuals, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same by the name of each block."""
     others = {n: v for n, v in values.items() if n not in PARAMETERS}
     parameters = parameters_of(values)
     found = residuals(parameters, others) if others else residuals(parameters)
-    return list(blocks_of("fit: `residuals`", found).values())
+    return blocks_of("fit: `residuals`", found)
 
 
 def _has_tangent(part: Tensor) -> bool:

@@ -92,6 +92,7 @@ def markers(
             placed=list(seen),
             labels=[f"vertex {i}" for i in marked],
             noise=noise,
+            used=known_rows,
         )
     )
     return difference.flatten()[mask.flatten().nonzero()[:, 0]]

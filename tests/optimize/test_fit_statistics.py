@@ -160,6 +160,8 @@ def test_a_report_begins_at_the_first_start_that_could_be_simulated(tmp_path):
 
 
 @pytest.mark.parametrize("first", [1e-4, 1e-3])
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_a_number_that_ends_at_a_bound_is_named(first):
     residuals = fit_to(TRUTH).compared[0]
     given = {"a": dc.Variable(2.0, bounds=(2.0, 9.0)), "b": dc.Variable(first, scale="log")}

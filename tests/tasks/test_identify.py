@@ -84,6 +84,8 @@ SHORT = {
 @pytest.mark.quick("fit_cantilever", "fit_hang")
 @pytest.mark.rounding
 @pytest.mark.parametrize("name", SHORT)
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_what_is_known_is_found_on_a_coarser_mesh(name):
     changes, shares = SHORT[name]
     first = read_config(CONFIGS / f"{name}.yaml").fit.trajectories
@@ -162,6 +164,7 @@ def test_observations_of_a_file_are_those_of_the_file(config):
 
 
 FALL = [
+    "fit.covariance=white",
     "simulation={dt: 0.01, steps: 16}",
     "scene.cloths.sheet.pins.top={vertices: [0, 1, 2]}",
     "scene.cloths.sheet.pose={}",
@@ -172,6 +175,7 @@ FALL = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
 def test_the_bias_of_the_time_step_is_reported(config, tmp_path):
     sets = [word for change in FALL for word in ("--set", change)]
     out = tmp_path / "out"
@@ -186,6 +190,7 @@ def test_the_bias_of_the_time_step_is_reported(config, tmp_path):
     assert record["values"]["normal_drag"] + shift == pytest.approx(2.0, rel=0.05)
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
 def test_extrapolated_configurations_are_fitted_without_the_bias(config):
     task = load_task(config, [*FALL, "fit.extrapolate=true"])
     found = dc.fit(task.variables(), task.residuals(), **task.options())
