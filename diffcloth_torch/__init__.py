@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize.descent import Descent, descend
     from diffcloth_torch.optimize.evaluation import Evaluation
     from diffcloth_torch.optimize.fit import Fit, Stage, fit
-    from diffcloth_torch.optimize.variables import Variable
+    from diffcloth_torch.optimize.variables import Prior, Tie, Variable
     from diffcloth_torch.sim.half_step import at_half_step
     from diffcloth_torch.sim.records.contact_points import ContactPoints
     from diffcloth_torch.sim.records.controls import Control, Parameters
@@ -95,6 +95,7 @@ __all__ = [
     "NoiseWarning",
     "NotConverged",
     "Parameters",
+    "Prior",
     "Report",
     "RigidBody",
     "Robot",
@@ -105,6 +106,7 @@ __all__ = [
     "Stage",
     "State",
     "StepBiasWarning",
+    "Tie",
     "Trajectory",
     "TurnedTooFar",
     "Variable",
@@ -160,7 +162,7 @@ _HOMES = {
     "optimize.descent": ("Descent", "descend"),
     "optimize.evaluation": ("Evaluation",),
     "optimize.fit": ("Fit", "Stage", "fit"),
-    "optimize.variables": ("Variable",),
+    "optimize.variables": ("Prior", "Tie", "Variable"),
     "sim.half_step": ("at_half_step",),
     "sim.records.contact_points": ("ContactPoints",),
     "sim.records.controls": ("Control", "Parameters"),

@@ -40,6 +40,7 @@ from diffcloth_torch.optimize.linearized import Linearized
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.misfit import Block, are_correlated, blocks_of_fit, warn_of_blocks
 from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, parameters_of, trajectories
+from diffcloth_torch.optimize.profile import Profile, profile_of
 from diffcloth_torch.optimize.series import Layout, is_walk, stretches, walk
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import (
@@ -52,11 +53,11 @@ from diffcloth_torch.optimize.uncertainty import (
     uncertainty_of,
     weights_of,
 )
-from diffcloth_torch.optimize.variables import Space, Variable
+from diffcloth_torch.optimize.variables import Prior, Space, Tie, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
 
-__all__ = ["Block", "Collinear", "Direction", "Fit", "Stage", "Start", "Trial", "fit"]
+__all__ = ["Block", "Collinear", "Direction", "Fit", "Profile", "Stage", "Start", "Trial", "fit"]
 
 _TINY = 1e-300
 _COVARIANCES = ("auto", "white", "robust")
@@ -95,6 +96,7 @@ class Fit:
         history: All evaluations, start after start.
         compared: The residuals of the last stage, and those kept out, for the report.
         linearized: Residuals of the last stage to first order in the fitted numbers.
+        job: Variables, stages and options of the fit.
     """
 
     parameters: Parameters
@@ -117,6 +119,7 @@ class Fit:
     history: list[Trial] = field(repr=False)
     compared: list[Residuals] = field(repr=False)
     linearized: Linearized = field(repr=False)
+    job: Job = field(repr=False)
 
     @property
     def rms(self) -> float:
@@ -132,6 +135,27 @@ class Fit:
     def failures(self) -> int:
         """Number of trial steps that were rejected."""
         return sum(bool(trial.failure) for trial in self.history)
+
+    def profile(self, name: str) -> Profile:
+        """Find the interval of a number from the cost itself, where a linear model is too rough.
+
+        At values to both sides, up to six half widths away, the other numbers are fitted again,
+        until the cost has risen by as much as a quadratic cost rises at the ends of the interval.
+        This costs a fit at each value, about six in all.
+
+        Args:
+            name: One of `names`.
+
+        Raises:
+            InvalidInput: If there is no such number, or the loss is robust.
+        """
+        if name not in self.names:
+            raise InvalidInput(f"Fit.profile: `name` may be {', '.join(self.names)}; got {name!r}")
+        if self.job.options.loss != "linear":
+            raise InvalidInput(
+                f'Fit.profile: the loss of the fit must be "linear", got {self.job.options.loss!r}'
+            )
+        return profile_of(self.job, self.linearized, self.cost, self.names.index(name))
 
     def step_bias(
         self, finer: Residuals, ratio: float = 2.0, *, max_evaluations: int = 4
@@ -270,7 +294,7 @@ class Fit:
 
 
 def fit(
-    variables: Mapping[str, Variable],
+    variables: Mapping[str, Variable | Tie],
     residuals: Residuals | Sequence[Stage],
     *,
     method: Method = "least_squares",
@@ -281,6 +305,7 @@ def fit(
     max_evaluations: int = 100,
     tolerance: float = 1e-8,
     covariance: Literal["auto", "white", "robust"] = "auto",
+    priors: Sequence[Prior] = (),
     hold_out: Residuals | None = None,
     workers: int | Executor = 0,
     deadline: float = DEADLINE,
@@ -293,8 +318,8 @@ def fit(
     >>> fit.values["stretch"], fit.intervals["stretch"]
 
     Args:
-        variables: Name -> variable. Names of fields of `Parameters` become that; others reach
-            `residuals` as a second argument.
+        variables: Name -> variable, or a `Tie` to another one. Names of fields of `Parameters`
+            become that; others reach `residuals` as a second argument.
         residuals: Function of a `Parameters` that holds the variables, and of name -> value of the
             other variables if there are some; returns a tensor, or a list of tensors, one for
             each trajectory, or a dict of name -> tensor: see `dc.residuals`. It is called with
@@ -317,6 +342,7 @@ def fit(
             tensor, or the markers of `residuals.markers`: from stretches of the series, and where
             these are short beside the correlation, as a random walk. "auto" takes "robust" where
             residuals are correlated, and warns.
+        priors: What is known beforehand of several variables together.
         hold_out: Residuals of trajectories that are kept out of the fit, as `residuals`.
         workers: Number of processes for the starts, 0 for none, or an executor of processes. The
             result has the same bits for any number. `residuals` must then be a function of a module
@@ -356,7 +382,9 @@ def fit(
     for name, function in (("hold_out", hold_out), ("progress", progress)):
         if not callable(function) and not (name == "hold_out" and function is None):
             raise TypeError(f"fit: `{name}` must be a function, got {type(function).__name__}")
-    space = Space(variables)
+    if not isinstance(priors, list | tuple):
+        raise TypeError(f"fit: `priors` must be a list of Prior, got {type(priors).__name__}")
+    space = Space(variables, priors)
     if hold_out is not None:
         _check_signature(hold_out, space)
         _errors(hold_out, space.values(torch.from_numpy(space.first)))  # refused before the fit
@@ -388,7 +416,7 @@ def fit(
     if best.success:
         warn_of_blocks(blocks, noise_model, correlated=correlated)
     at_bounds = space.at_bounds(best.theta)
-    _warn_of_bounds(variables, space, at_bounds)
+    _warn_of_bounds(space, at_bounds)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     linearized = Linearized(
         space=space,
@@ -419,6 +447,7 @@ def fit(
         history=[trial for end in ends for trial in end.history],
         compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
         linearized=linearized,
+        job=job,
     )
 
 
@@ -542,9 +571,7 @@ def _errors(residuals: Residuals, values: Mapping[str, Tensor]) -> list[float]:
     return [float(part.square().mean().sqrt()) for part in parts]
 
 
-def _warn_of_bounds(
-    variables: Mapping[str, Variable], space: Space, at_bounds: Sequence[str]
-) -> None:
+def _warn_of_bounds(space: Space, at_bounds: Sequence[str]) -> None:
     """Warn of numbers that ended at a bound which nobody gave."""
     for name in space.default_bounds:
         here = [n for n in at_bounds if n.partition("[")[0] == name]

@@ -44,10 +44,9 @@ class Linearized:
         space, free = self.space, ~self.held
         units = space.units(self.theta)[free]
         roots = np.sqrt(self.weights)
-        priors = space.precisions
-        rows = np.vstack([roots[:, None] * self.jacobian, np.diag(priors)])[:, free] * units
+        rows = np.vstack([roots[:, None] * self.jacobian, space.whitening])[:, free] * units
         change = residuals - self.residuals
-        right = np.concatenate([roots * change, priors * (at - self.theta)])
+        right = np.concatenate([roots * change, space.whitening @ (at - self.theta)])
         step = np.zeros(len(space))
         step[free] = -units * np.linalg.lstsq(rows, right, rcond=_SINGULAR)[0]
         return np.clip(at + step, space.low, space.high) - at

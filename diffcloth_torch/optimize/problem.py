@@ -156,16 +156,15 @@ class Problem:
         self._space, self._at, self._rows = space, torch.from_numpy(at.copy()), rows
         self._residuals, self._memory, self._report = residuals, memory, report
         self._start, self._stage, self._count = start, stage, 0
-        self._known = torch.from_numpy(np.flatnonzero(space.precisions[rows]))
-        self._means = torch.from_numpy(space.means[rows])[self._known]
-        self._precisions = torch.from_numpy(space.precisions[rows])[self._known]
+        self._means = torch.from_numpy(space.means)
+        self._whitening = torch.from_numpy(space.whitening)
         self.layout: Layout | None = None
         self._last: tuple[bytes, FloatArray | Failure] | None = None
 
     @property
     def prior_count(self) -> int:
         """Number of the residuals, the last ones, that are those of priors."""
-        return len(self._known)
+        return len(self._whitening)
 
     def require(self, theta: FloatArray) -> None:
         """Evaluate at a start, where a failure ends it.
@@ -323,7 +322,7 @@ class Problem:
 
     def _with_priors(self, parts: Sequence[Tensor], theta: Tensor) -> Tensor:
         found = [part.reshape(-1).to(torch.float64) for part in parts]
-        return torch.cat([*found, (theta[self._known] - self._means) * self._precisions])
+        return torch.cat([*found, self._whitening @ (self._whole(theta) - self._means)])
 
     def _whole(self, theta: Tensor) -> Tensor:
         return self._at.index_copy(0, torch.from_numpy(self._rows), theta)

@@ -134,7 +134,7 @@ def noise_of(residuals: FloatArray, numbers: int, loss: str, scale: float) -> No
 def leverages(space: Space, theta: FloatArray, jacobian: FloatArray) -> FloatArray:
     """Share of each residual that the fitted numbers absorb [M]: the diagonal of J H^-1 J^T."""
     units = space.units(theta)
-    rows = np.vstack([jacobian * units, np.diag(space.precisions * units)])
+    rows = np.vstack([jacobian * units, space.whitening * units])
     left, singular, _ = np.linalg.svd(rows, full_matrices=False)
     known = singular > _SINGULAR * singular.max()
     shares: FloatArray = np.square(left[: len(jacobian), known]).sum(axis=1)
@@ -173,8 +173,10 @@ def uncertainty_of(
     noise = found.deviation
     # In sizes of the variables, so that directions compare.
     units = space.units(theta)
-    priors = np.diag(space.precisions * units)
-    rows = np.vstack([jacobian * units, priors * (noise if spread is None else 1.0)])
+    priors = space.whitening * units
+    scale = noise if spread is None else 1.0
+    # With zero rows, where residuals are fewer than numbers, no direction is left out.
+    rows = np.vstack([jacobian * units, priors * scale, np.zeros((len(space), len(space)))])
     left, singular, directions = np.linalg.svd(rows, full_matrices=False)
     if spread is None:
         middle = noise**2 * np.eye(len(singular))

@@ -217,3 +217,37 @@ def test_nearly_collinear_numbers_are_named():
 def test_another_covariance_is_refused():
     with pytest.raises(dc.InvalidInput, match="`covariance` must be"):
         fit_to(white(0), covariance="blocks")
+
+
+def test_the_profile_of_a_linear_model_is_its_interval():
+    rng = np.random.default_rng(8)
+    design = torch.from_numpy(rng.standard_normal((30, 3)))
+    noise = torch.from_numpy(rng.standard_normal(30))
+    free = {"x": dc.Variable([0.0, 0.0, 0.0])}
+    found = dc.fit(free, lambda p, v: design @ (v["x"] - 1.0) - noise)
+    profile = found.profile("x[1]")
+    assert profile.interval == pytest.approx(found.intervals["x[1]"], rel=1e-6)
+    assert profile.rises.min() == 0.0
+    assert (np.diff(profile.values) > 0).all()
+    alone = dc.fit({"y": dc.Variable(0.0)}, lambda p, v: v["y"] - noise)
+    assert alone.profile("y").interval == pytest.approx(alone.intervals["y"], rel=1e-6)
+
+
+def test_a_profile_knows_a_model_that_is_not_linear():
+    """x^2 = 1 + noise, near zero: the rise of the cost against its formula on both sides."""
+    noise = torch.tensor([-0.8, 0.9, -0.1, 0.2], dtype=F64)
+    free = {"x": dc.Variable(0.5, bounds=(0.0, 10.0))}
+    found = dc.fit(free, lambda p, v: v["x"] ** 2 - 0.3 - noise)
+    low, high = found.profile("x").interval
+    x2 = float(found.values["x"]) ** 2
+    reach = (found.intervals["x"][1] - float(found.values["x"])) * 2 * x2**0.5
+    assert high == pytest.approx((x2 + reach) ** 0.5, rel=0.02)
+    assert low == 0.0, "the bound is reached before the cost has risen"
+    assert found.intervals["x"][0] < 0.0
+
+
+def test_profiles_refuse_other_numbers_and_robust_losses():
+    with pytest.raises(dc.InvalidInput, match="`name` may be a, b; got 'c'"):
+        fit_to(white(0)).profile("c")
+    with pytest.raises(dc.InvalidInput, match="must be \"linear\", got 'huber'"):
+        fit_to(white(0), loss="huber").profile("a")
