@@ -36,6 +36,7 @@ from diffcloth_torch.lock import locked
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.bias import factor_of, limit_of, moves_of
 from diffcloth_torch.optimize.fit_page import Page, write_page
+from diffcloth_torch.optimize.forecast import Prediction, expected_half_widths, predict
 from diffcloth_torch.optimize.linearized import Linearized
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.misfit import Block, are_correlated, blocks_of_fit, warn_of_blocks
@@ -57,9 +58,21 @@ from diffcloth_torch.optimize.variables import Prior, Space, Tie, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
 
-__all__ = ["Block", "Collinear", "Direction", "Fit", "Profile", "Stage", "Start", "Trial", "fit"]
+__all__ = [
+    "Block",
+    "Collinear",
+    "Direction",
+    "Fit",
+    "Prediction",
+    "Profile",
+    "Stage",
+    "Start",
+    "Trial",
+    "fit",
+]
 
 _TINY = 1e-300
+_SHOWN = 20  # numbers that a repr lists
 _COVARIANCES = ("auto", "white", "robust")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 
@@ -121,6 +134,17 @@ class Fit:
     linearized: Linearized = field(repr=False)
     job: Job = field(repr=False)
 
+    def __repr__(self) -> str:
+        """List the numbers with their intervals, and the size of the residuals."""
+        lines = [f"Fit: rms {self.rms:.3g}, {self.noise_model}, {self.message}"]
+        numbers = self.linearized.space.from_theta(self.linearized.theta)
+        for name, number in list(zip(self.names, numbers, strict=True))[:_SHOWN]:
+            low, high = self.intervals[name]
+            lines.append(f"  {name} {number:.6g}, between {low:.4g} and {high:.4g}")
+        if len(self.names) > _SHOWN:
+            lines.append(f"  and {len(self.names) - _SHOWN} more")
+        return "\n".join(lines)
+
     @property
     def rms(self) -> float:
         """Root mean square of the residuals: about one if the model is right, in known noise."""
@@ -156,6 +180,45 @@ class Fit:
                 f'Fit.profile: the loss of the fit must be "linear", got {self.job.options.loss!r}'
             )
         return profile_of(self.job, self.linearized, self.cost, self.names.index(name))
+
+    def predict(self, function: Residuals) -> Prediction:
+        """Evaluate a quantity at the fitted numbers, with a band of 95 % to first order.
+
+        Args:
+            function: Of the same arguments as `residuals`; returns a tensor, as the positions of a
+                motion that nobody recorded.
+
+        Raises:
+            InvalidInput: If the observations leave a number unknown.
+            TypeError: If `function` is none, or returns something else than a tensor.
+            SimulationError: If the simulation fails.
+        """
+        if not callable(function):
+            raise TypeError(
+                f"Fit.predict: `function` must be a function, got {type(function).__name__}"
+            )
+        return predict(self.linearized, function)
+
+    def information(self, candidate: Residuals) -> dict[str, float]:
+        """Expect the half widths of the intervals if a recording were added: which one is next?
+
+        Args:
+            candidate: Residuals of the recording, as those of `fit`, in units of its noise. Their
+                values do not matter: compare with anything of the right shape.
+
+        Returns:
+            Name of each number -> expected half width, in the unit of the number.
+
+        Raises:
+            InvalidInput: If a number would still be unknown.
+            TypeError: If `candidate` is no function.
+            SimulationError: If the simulation fails.
+        """
+        if not callable(candidate):
+            raise TypeError(
+                f"Fit.information: `candidate` must be a function, got {type(candidate).__name__}"
+            )
+        return expected_half_widths(self.linearized, candidate)
 
     def step_bias(
         self, finer: Residuals, ratio: float = 2.0, *, max_evaluations: int = 4
@@ -425,6 +488,9 @@ def fit(
         jacobian=best.jacobian,
         weights=weights_of(best.residuals, loss, job.options.loss_scale)[0],
         half_widths=found.half_widths,
+        covariance=found.of_theta,
+        precision_root=found.precision_root,
+        reach=found.reach,
     )
     return Fit(
         parameters=parameters_of(values),

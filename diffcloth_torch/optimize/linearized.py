@@ -26,6 +26,9 @@ class Linearized:
         jacobian: Their derivative by theta [M, p].
         weights: Weight of each residual in the cost [M]: one unless the loss is robust.
         half_widths: Half widths of the intervals of theta [p].
+        covariance: Covariance of theta [p, p].
+        precision_root: Rows R with R^T R the inverse of this covariance.
+        reach: Half width of an interval of 95 % in standard errors.
     """
 
     space: Space
@@ -34,6 +37,9 @@ class Linearized:
     jacobian: FloatArray
     weights: FloatArray
     half_widths: FloatArray
+    covariance: FloatArray
+    precision_root: FloatArray
+    reach: float
 
     def step(self, at: FloatArray, residuals: FloatArray) -> FloatArray:
         """Step [p] from `at` towards the least squares of other residuals, with this Jacobian.

@@ -92,6 +92,9 @@ class Uncertainty(NamedTuple):
         collinear: Numbers that are known almost only together with another.
         deviations: Standard error of each theta [p].
         half_widths: Half widths of the intervals of theta [p].
+        of_theta: Covariance of theta [p, p].
+        precision_root: Rows R with R^T R the inverse of this covariance.
+        reach: Half width of an interval of 95 % in standard errors.
     """
 
     covariance: FloatArray
@@ -101,6 +104,9 @@ class Uncertainty(NamedTuple):
     collinear: list[Collinear]
     deviations: FloatArray
     half_widths: FloatArray
+    of_theta: FloatArray
+    precision_root: FloatArray
+    reach: float
 
 
 class Noise(NamedTuple):
@@ -193,7 +199,8 @@ def uncertainty_of(
     covariance = rates[:, None] * of_theta * rates
     deviations = np.sqrt(np.diag(covariance))
     errors = np.sqrt(np.diag(of_theta))
-    half_widths = _reach(found.freedom) * errors
+    reach = _reach(found.freedom)
+    half_widths = reach * errors
     correlation = _correlation(covariance, deviations)
     with np.errstate(divide="ignore"):
         alone = noise / np.linalg.norm(np.vstack([jacobian * units, priors * noise]), axis=0)
@@ -205,7 +212,20 @@ def uncertainty_of(
         collinear=_collinear(space.names, correlation, errors / units, alone),
         deviations=errors,
         half_widths=half_widths,
+        of_theta=of_theta,
+        precision_root=_inverse_root(middle) @ (singular[:, None] * directions / units),
+        reach=reach,
     )
+
+
+def _inverse_root(middle: FloatArray) -> FloatArray:
+    """Rows R with R^T R = M^-1; huge where M is zero, as where residuals show no noise.
+
+    The covariance V S^-1 M S^-1 V^T has the inverse Q^T Q with Q = R S V^T.
+    """
+    sizes, directions = np.linalg.eigh(middle)
+    root: FloatArray = (directions / np.sqrt(np.maximum(sizes, _TINY))).T
+    return root
 
 
 def _collinear(
