@@ -251,3 +251,16 @@ def test_profiles_refuse_other_numbers_and_robust_losses():
         fit_to(white(0)).profile("c")
     with pytest.raises(dc.InvalidInput, match="must be \"linear\", got 'huber'"):
         fit_to(white(0), loss="huber").profile("a")
+
+
+def test_a_wrong_model_is_told():
+    """An exponential fitted to a hyperbola, whose residuals are twice their noise."""
+    seen = 2.0 / (1.0 + TIMES) ** 4 + 0.01 * torch.from_numpy(white(2))
+
+    def residuals(parameters, values):
+        return (values["a"] * torch.exp(-values["b"] * TIMES) - seen) / 0.01
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dc.fit(variables(), residuals)
+    assert {w.category for w in caught} >= {dc.ModelErrorWarning, dc.CorrelatedResidualsWarning}
