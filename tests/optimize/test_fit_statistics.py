@@ -45,7 +45,7 @@ def test_standard_errors_are_the_spread_of_fits_to_other_noise(loss):
         rng = np.random.default_rng(seed)
         noise = NOISE * rng.standard_normal(60)
         noise = np.where(rng.random(60) < outliers, 20 * noise, noise)
-        found = fit_to(TRUTH + torch.from_numpy(noise), loss=loss)
+        found = fit_to(TRUTH + torch.from_numpy(noise), loss=loss, covariance="white")
         values.append([float(v) for v in found.values.values()])
         errors.append(np.sqrt(np.diag(found.covariance)))
     # The spread of 60 fits is known to a tenth.
