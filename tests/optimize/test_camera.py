@@ -19,10 +19,27 @@ TIMES = np.arange(0.02, 0.18, 1 / 60)
 
 
 def test_positions_between_states_are_hermite_cubics():
-    t = STATES.time.numpy()
-    expected = CubicHermiteSpline(t, STATES.positions.numpy(), STATES.velocities.numpy())(TIMES)
+    t, v = STATES.time.numpy(), STATES.velocities.numpy().copy()
+    v[:-1] = (v[:-1] + v[1:]) / 2  # at the times of the states
+    expected = CubicHermiteSpline(t, STATES.positions.numpy(), v)(TIMES)
     np.testing.assert_allclose(STATES.at(TIMES).numpy(), expected, atol=1e-14)
     torch.testing.assert_close(STATES.at(STATES.time), STATES.positions, atol=1e-14, rtol=0)
+
+
+def test_states_that_are_several_steps_apart_have_their_own_velocities():
+    few = STATES[::4]
+    spline = CubicHermiteSpline(few.time.numpy(), few.positions.numpy(), few.velocities.numpy())
+    np.testing.assert_allclose(few.at(TIMES).numpy(), spline(TIMES), atol=1e-14)
+
+
+def test_free_fall_by_the_second_order_step_is_a_parabola_between_states():
+    cloth = dc.Cloth.grid(2, 2, 0.1)
+    sim = dc.Simulator(dc.Scene([cloth]), 0.02, integrator="second_order")
+    start = sim.initial_state()
+    states = dc.Trajectory([start, *sim.rollout(start, steps=5)])
+    times = np.array([0.003, 0.01, 0.05, 0.071])
+    fallen = (states.at(times) - start.positions)[:, 0, 2].numpy()
+    np.testing.assert_allclose(fallen, -9.81 * times**2 / 2, atol=1e-9)
 
 
 def test_positions_are_differentiable_in_times_and_states():

@@ -29,6 +29,7 @@ __all__ = ["Trajectory", "check_ending"]
 _FILES = (".pt", ".npz")  # of data; the others are animations
 
 _ROUNDING = 1e-9  # of the largest time, by which a time may be outside
+_ONE_STEP = 1e-6  # share of the largest displacement by which two states may differ from one step
 
 
 class Trajectory(list[State]):
@@ -66,6 +67,11 @@ class Trajectory(list[State]):
     def at(self, times: object) -> Tensor:
         """Positions between the states: cubic in time, by positions and velocities.
 
+        Velocities of states are means over the step that led to them, with both integrators.
+        Between two states that are one step apart, the velocity at the first is therefore the mean
+        of both; at other states it is the one that they have, which is half a step early. Keep all
+        steps where the step is not short beside the motion.
+
         >>> dc.Trajectory([start, *states]).at(camera_times - delay)
 
         Args:
@@ -99,7 +105,8 @@ class Trajectory(list[State]):
         clock = torch.from_numpy(known)
         step = (clock[after] - clock[before]).reshape(-1, *[1] * self[0].positions.dim())
         s = (asked - clock[before]).reshape(step.shape) / step
-        x, v = self.positions, self.velocities
+        x = self.positions
+        v = self._velocities_in_time(x, clock)
         # Hermite's cubics, with the velocities in steps.
         return (
             (1 + 2 * s) * (1 - s) ** 2 * x[before]
@@ -107,6 +114,17 @@ class Trajectory(list[State]):
             + s**2 * (3 - 2 * s) * x[after]
             + s**2 * (s - 1) * step * v[after]
         )
+
+    def _velocities_in_time(self, positions: Tensor, clock: Tensor) -> Tensor:
+        """Velocities at the times of the states: means of two steps where both are known."""
+        v = self.velocities
+        x, steps = torch.from_numpy(numbers_of(positions)), torch.from_numpy(numbers_of(v))[1:]
+        moved = x.diff(dim=0)
+        times = clock.diff().reshape(-1, *[1] * (x.dim() - 1))
+        left = (moved - times * steps).abs().amax(dim=tuple(range(1, x.dim())))
+        is_one_step = left <= _ONE_STEP * moved.abs().max()
+        weights = (0.5 * is_one_step).to(v.dtype).reshape(times.shape)
+        return torch.cat([v[:-1] + weights * (v[1:] - v[:-1]), v[-1:]])
 
     def _times(self, owner: str) -> FloatArray:
         """Times of the states [s], which must increase."""
