@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from diffcloth_torch.checks import Range, check_number
+from diffcloth_torch.checks import POSITIVE, Range, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.compared import Comparison, blocks_of, note, noting
 
@@ -56,13 +56,16 @@ def extrapolated(
     finer: Callable[..., Any] | None = None,
     *,
     ratio: float = 2.0,
+    order: float = 1.0,
 ) -> Callable[..., dict[str, Tensor]]:
     """Residuals of a simulation with the time step h, extrapolated to a time step of zero.
 
     Implicit Euler has an error of first order, r(h) = r(0) + a h + b h^2 + ... where the motion is
     smooth. Residuals of two time steps, `2 fine - coarse` for the ratio 2, have an error of second
-    order; those of three, of third order (Richardson, 1911). Impacts, changes between sticking and
-    slipping, and buckling are not smooth in h: check such a motion with a third time step.
+    order; those of three, of third order (Richardson, 1911). For `integrator="second_order"` give
+    `order=2`: the weights of two time steps are then 4/3 and -1/3. Impacts, changes between
+    sticking and slipping, and buckling are not smooth in h: check such a motion with a third time
+    step.
 
     Only residuals that are linear in positions can be combined, as `markers`. `point_cloud` and
     `outline` choose the nearest vertex or edge in each simulation anew, and are refused.
@@ -72,25 +75,28 @@ def extrapolated(
         fine: The same at h / ratio, with as many residuals in the same order.
         finer: The same at h / ratio^2; None combines two time steps.
         ratio: Ratio of two successive time steps, > 1.
+        order: Power of h in the error, > 0; that of the next term is larger by one.
 
     Returns:
         A function for `fit`. It can be pickled if the given ones can.
 
     Raises:
-        InvalidInput: If `ratio` is not accepted; in a call, if the residuals cannot be combined.
+        InvalidInput: If `ratio` or `order` is not accepted; in a call, if the residuals cannot be
+            combined.
         TypeError: If one of the levels is not a function.
     """
     levels = (coarse, fine) if finer is None else (coarse, fine, finer)
     for name, level in zip(("coarse", "fine", "finer"), levels, strict=False):
         if not callable(level):
             raise TypeError(f"{_OWNER}: `{name}` must be a function, got {type(level).__name__}")
-    q = check_number(f"{_OWNER}: `ratio`", ratio, RATIOS)
+    base = check_number(f"{_OWNER}: `ratio`", ratio, RATIOS)
+    q = base ** check_number(f"{_OWNER}: `order`", order, POSITIVE)
     a, b = -1 / (q - 1), q / (q - 1)
     weights: tuple[float, ...] = (a, b)
     if finer is not None:
-        # The errors of second order of the two extrapolations differ by the factor q^2.
-        once = ((a, b, 0.0), (0.0, a, b))
-        weights = tuple((q * q * y - x) / (q * q - 1) for x, y in zip(*once, strict=True))
+        # The errors of the next order of the two extrapolations differ by the next power.
+        once, r = ((a, b, 0.0), (0.0, a, b)), q * base
+        weights = tuple((r * y - x) / (r - 1) for x, y in zip(*once, strict=True))
     return _Extrapolated(levels, weights)
 
 

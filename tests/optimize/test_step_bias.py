@@ -60,6 +60,27 @@ def test_extrapolation_removes_a_power_of_the_time_step_with_each_level(ratio):
     torch.testing.assert_close(three, (7 * h.prod()).expand(2), atol=1e-14, rtol=0)
 
 
+def test_extrapolation_of_a_second_order_step():
+    def at(h):
+        return lambda parameters: torch.tensor([2 + 3 * h**2 + 4 * h**3], dtype=F64)
+
+    levels = [at(0.1), at(0.05), at(0.025)]
+    two = dc.residuals.extrapolated(*levels[:2], order=2)(None)["residuals"]
+    three = dc.residuals.extrapolated(*levels, order=2)(None)["residuals"]
+    assert float(two) == pytest.approx(2 - 4 * 0.1**3 / 6, abs=1e-14)
+    assert float(three) == pytest.approx(2, abs=1e-14)
+
+
+def test_the_shift_of_a_second_order_step():
+    def at(h):
+        return lambda parameters, values: values["x"] - 2 - 3 * h**2 + 0 * torch.ones(4)
+
+    found = dc.fit({"x": dc.Variable(1.0)}, at(0.1), covariance="white")
+    with pytest.warns(dc.StepBiasWarning):
+        shift = found.step_bias(at(0.05), order=2)
+    assert float(found.values["x"] + shift["x"]) == pytest.approx(2, abs=1e-6)
+
+
 def test_the_interval_misses_the_truth_and_a_warning_tells_the_shift():
     found = dc.fit(variables(), Decay(0.05))
     low, high = found.intervals["b"]
