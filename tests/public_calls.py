@@ -295,6 +295,12 @@ class World:
         return f64([0.01] * len(robot.joint_names))
 
 
+def fit_loading(w):
+    path = w.folder / "kept_fit.pt"
+    w.fit.save(path)
+    return call(dc.Fit.load, path, w.residual)
+
+
 def saving(w):
     path = w.folder / "trainer.pt"
     trainer = w.trainer
@@ -338,6 +344,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "Evaluation.is_better_than": lambda w: call(w.found.best.is_better_than, w.found.first),
     "Evaluation.record": lambda w: call(w.found.best.record),
     "Fit": lambda w: record(dc.Fit, w.fit),
+    "Fit.lines": lambda w: call(w.fit.lines),
+    "Fit.load": fit_loading,
+    "Fit.save": lambda w: call(w.fit.save, w.folder / "fit.pt"),
     "Fit.mesh_bias": lambda w: call(w.fit.mesh_bias, w.residual, order=2.0),
     "Fit.step_bias": lambda w: call(w.fit.step_bias, w.residual, max_evaluations=1),
     "Fit.information": lambda w: call(w.fit.information, w.residual),

@@ -95,10 +95,7 @@ def _run(task: Identify, out: Path) -> str:
     bias = _step_bias(task, found)
     write_metrics(out / _RESULT, _record(task, found) | {"step_bias": bias})
     found.report(out / _PAGE)
-    lines = [
-        f"{name} {_number(found, k):.5g}, between {low:.5g} and {high:.5g}"
-        for k, (name, (low, high)) in enumerate(found.intervals.items())
-    ]
+    lines = found.lines()
     lines += [
         f"a time step of zero would move {name} by {', '.join(f'{x:+.3g}' for x in shifts)}"
         for name, shifts in (bias or {}).items()
@@ -113,7 +110,7 @@ def _step_bias(task: Identify, found: Fit) -> dict[str, list[float]] | None:
     """Shifts of each variable in the limit of a time step of zero; None if not estimated."""
     if not task.checks_step:
         return None
-    shifts = found.step_bias(task.finer(task.observed))
+    shifts = found.step_bias(task.finer(task.observed), order=task.order)
     return {name: shift.reshape(-1).tolist() for name, shift in shifts.items()}
 
 
@@ -150,11 +147,6 @@ def _record(task: Identify, found: Fit) -> dict[str, Any]:
             for t in found.history
         ],
     }
-
-
-def _number(found: Fit, k: int) -> float:
-    free = dict.fromkeys(name.partition("[")[0] for name in found.names)
-    return [float(x) for name in free for x in found.values[name].flatten()][k]
 
 
 def _short(value: Tensor) -> str:

@@ -38,7 +38,7 @@ class Limit(NamedTuple):
 def limit_of(
     owner: str,
     model: Linearized,
-    coarse: Residuals,
+    coarse: Residuals | None,
     finer: Residuals,
     factor: float,
     max_evaluations: int,
@@ -48,7 +48,7 @@ def limit_of(
     Args:
         owner: Operation that a message names.
         model: Linear model of the fit.
-        coarse: The residuals r of the fit.
+        coarse: The residuals r of the fit, for more than one evaluation.
         finer: The residuals f with a smaller error.
         factor: See `factor_of`.
         max_evaluations: Largest number of evaluations of `finer`.
@@ -57,7 +57,7 @@ def limit_of(
         raise TypeError(f"{owner}: `finer` must be a function, got {type(finer).__name__}")
     at, found, last = model.theta, model.residuals, 0.0
     for k in range(max_evaluations):
-        if k:
+        if k and coarse is not None:
             found = _evaluate(owner, model, coarse, at)
         fine = _evaluate(owner, model, finer, at)
         step = model.step(at, found + factor * (fine - found))

@@ -6,13 +6,14 @@ the residuals comes from tangents of the simulation, one for each number that is
 
 from __future__ import annotations
 
+import copy
 import difflib
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +36,7 @@ from diffcloth_torch.files import as_path
 from diffcloth_torch.lock import locked
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.bias import factor_of, limit_of, moves_of
+from diffcloth_torch.optimize.fit_files import Solved, read_fit, write_fit
 from diffcloth_torch.optimize.fit_page import Page, write_page
 from diffcloth_torch.optimize.forecast import Prediction, expected_half_widths, predict
 from diffcloth_torch.optimize.linearized import Linearized
@@ -43,7 +45,7 @@ from diffcloth_torch.optimize.misfit import Block, are_correlated, blocks_of_fit
 from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, parameters_of, trajectories
 from diffcloth_torch.optimize.profile import Profile, profile_of
 from diffcloth_torch.optimize.series import Layout, is_walk, stretches, walk
-from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
+from diffcloth_torch.optimize.starts import End, Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import (
     Collinear,
     Direction,
@@ -54,7 +56,7 @@ from diffcloth_torch.optimize.uncertainty import (
     uncertainty_of,
     weights_of,
 )
-from diffcloth_torch.optimize.variables import Prior, Space, Tie, Variable
+from diffcloth_torch.optimize.variables import Prior, Space, Tie, Values, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
 
@@ -72,6 +74,7 @@ __all__ = [
 ]
 
 _TINY = 1e-300
+_SAME = 1e-6  # relative and absolute difference of residuals that are the same
 _SHOWN = 20  # numbers that a repr lists
 _COVARIANCES = ("auto", "white", "robust")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
@@ -109,7 +112,7 @@ class Fit:
         history: All evaluations, start after start.
         compared: The residuals of the last stage, and those kept out, for the report.
         linearized: Residuals of the last stage to first order in the fitted numbers.
-        job: Variables, stages and options of the fit.
+        solved: What the fit follows from, as `save` writes it.
     """
 
     parameters: Parameters
@@ -132,18 +135,97 @@ class Fit:
     history: list[Trial] = field(repr=False)
     compared: list[Residuals] = field(repr=False)
     linearized: Linearized = field(repr=False)
-    job: Job = field(repr=False)
+    solved: Solved = field(repr=False)
 
     def __repr__(self) -> str:
         """List the numbers with their intervals, and the size of the residuals."""
         lines = [f"Fit: rms {self.rms:.3g}, {self.noise_model}, {self.message}"]
-        numbers = self.linearized.space.from_theta(self.linearized.theta)
-        for name, number in list(zip(self.names, numbers, strict=True))[:_SHOWN]:
-            low, high = self.intervals[name]
-            lines.append(f"  {name} {number:.6g}, between {low:.4g} and {high:.4g}")
+        lines += [f"  {line}" for line in self.lines()[:_SHOWN]]
         if len(self.names) > _SHOWN:
             lines.append(f"  and {len(self.names) - _SHOWN} more")
         return "\n".join(lines)
+
+    def lines(self) -> list[str]:
+        """Describe each number in a sentence: its value and interval, or that it is not known."""
+        numbers = self.linearized.space.from_theta(self.linearized.theta)
+        return [
+            f"{name} {number:.6g}, {self._interval_text(name)}"
+            for name, number in zip(self.names, numbers, strict=True)
+        ]
+
+    def _interval_text(self, name: str) -> str:
+        if name in self.linearized.untold:
+            return "which the observations do not tell"
+        low, high = self.intervals[name]
+        return f"between {low:.4g} and {high:.4g}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the functions, as `save` does."""
+        kept = {"compared": [], "solved": self.solved.without_functions()}
+        return self.__dict__ | kept
+
+    def __copy__(self) -> Fit:
+        return replace(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Fit:
+        return replace(self, **{n: copy.deepcopy(v, memo) for n, v in self.__dict__.items()})
+
+    def save(self, path: str | Path) -> None:
+        """Write the fit to a file, without the functions that made it.
+
+        Args:
+            path: The file, in an existing folder; an existing file is replaced.
+
+        Raises:
+            InvalidInput: If a tie is a function.
+            OSError: If it cannot be written.
+        """
+        write_fit(as_path("Fit.save: `path`", path), self.solved)
+
+    @staticmethod
+    def load(
+        path: str | Path, residuals: Residuals | None = None, hold_out: Residuals | None = None
+    ) -> Fit:
+        """Read a fit that `save` has written.
+
+        Args:
+            path: The file.
+            residuals: The residuals of the last stage, which files do not hold. Without them
+                `profile`, `report` and more than one evaluation of `step_bias` and `mesh_bias` are
+                refused. They are evaluated once, and compared with those of the fit.
+            hold_out: Residuals that were kept out, for `report`; needs `residuals`.
+
+        Returns:
+            The fit. A profile of it is solved by "least_squares" where the fit was by torch.
+
+        Raises:
+            InvalidInput: If the file holds no fit, or `residuals` differ from those of the fit.
+            OSError: If it cannot be read.
+            SimulationError: If the simulation of `residuals` fails.
+        """
+        owner = "Fit.load"
+        file = as_path(f"{owner}: `path`", path)
+        given: Any = {"residuals": residuals, "hold_out": hold_out}
+        for name, function in given.items():
+            if function is not None and not callable(function):
+                kind = type(function).__name__
+                raise TypeError(f"{owner}: `{name}` must be a function, got {kind}")
+        if residuals is None and hold_out is not None:
+            raise InvalidInput(f"{owner}: `hold_out` needs `residuals`")
+        compared = [function for function in given.values() if function is not None]
+        found = _assemble(read_fit(owner, file), compared)
+        if residuals is not None:
+            _check_same(owner, residuals, found)
+        return found
+
+    def _functions(self, owner: str) -> list[Residuals]:
+        """The residuals, of which a fit from a file has none."""
+        if not self.compared:
+            raise InvalidInput(
+                f"{owner}: a fit from a file has no residuals: give them to Fit.load(path, "
+                "residuals)"
+            )
+        return self.compared
 
     @property
     def rms(self) -> float:
@@ -175,11 +257,13 @@ class Fit:
         """
         if name not in self.names:
             raise InvalidInput(f"Fit.profile: `name` may be {', '.join(self.names)}; got {name!r}")
-        if self.job.options.loss != "linear":
+        options = self.solved.options
+        if options.loss != "linear":
             raise InvalidInput(
-                f'Fit.profile: the loss of the fit must be "linear", got {self.job.options.loss!r}'
+                f'Fit.profile: the loss of the fit must be "linear", got {options.loss!r}'
             )
-        return profile_of(self.job, self.linearized, self.cost, self.names.index(name))
+        residuals, row = self._functions("Fit.profile")[0], self.names.index(name)
+        return profile_of(residuals, options, self.linearized, self.cost, row)
 
     def predict(self, function: Residuals) -> Prediction:
         """Evaluate a quantity at the fitted numbers, with a band of 95 % to first order.
@@ -221,20 +305,27 @@ class Fit:
         return expected_half_widths(self.linearized, candidate)
 
     def step_bias(
-        self, finer: Residuals, ratio: float = 2.0, *, max_evaluations: int = 4
+        self,
+        finer: Residuals,
+        ratio: float = 2.0,
+        *,
+        order: float = 1.0,
+        max_evaluations: int = 4,
     ) -> dict[str, Tensor]:
         """Estimate how far the time step h shifts the fitted numbers.
 
         With residuals r of the fit and f of the time step h / ratio, residuals in the limit h = 0
-        are r + (f - r) ratio / (ratio - 1) to first order in h. The least squares of these lie
-        -(J^T J + P^2)^-1 J^T (f - r) ratio / (ratio - 1) from the solution, with the Jacobian J
-        and the precisions P of the priors. Where this step is not small beside the intervals, both
-        residuals are evaluated again behind it, with the same Jacobian.
-        See `residuals.extrapolated` for the motions to which this applies.
+        are r + (f - r) q / (q - 1) to the leading order in h, with q = ratio^order. The least
+        squares of these lie -(J^T J + P^2)^-1 J^T (f - r) q / (q - 1) from the solution, with the
+        Jacobian J and the precisions P of the priors. Where this step is not small beside the
+        intervals, both residuals are evaluated again behind it, with the same Jacobian. See
+        `residuals.extrapolated` for the motions to which this applies.
 
         Args:
             finer: The residuals of the last stage, from a simulation with the time step h / ratio.
             ratio: Ratio of the two time steps, > 1.
+            order: Power of h in the error of positions, > 0: 1 with implicit Euler, 2 with
+                `integrator="second_order"`.
             max_evaluations: Of `finer`, >= 1; one suffices where the bias is small.
 
         Returns:
@@ -249,7 +340,7 @@ class Fit:
             StepBiasWarning: If a shift exceeds the half width of the interval of its number.
         """
         owner = "Fit.step_bias"
-        factor = factor_of(owner, ratio, 1.0)
+        factor = factor_of(owner, ratio, order)
         return self._bias(owner, finer, factor, max_evaluations, "time step", StepBiasWarning)
 
     def mesh_bias(
@@ -295,7 +386,8 @@ class Fit:
     ) -> dict[str, Tensor]:
         check_count(f"{owner}: `max_evaluations`", max_evaluations, 1)
         model = self.linearized
-        limit = limit_of(owner, model, self.compared[0], finer, factor, max_evaluations)
+        coarse = self._functions(owner)[0] if max_evaluations > 1 else None
+        limit = limit_of(owner, model, coarse, finer, factor, max_evaluations)
         moved = moves_of(model, limit.theta)
         unsettled = max_evaluations > 1 and limit.last_step > 1.0
         if moved or unsettled:
@@ -334,13 +426,14 @@ class Fit:
         file = as_path("Fit.report: `path`", path)
         if file.suffix != ".html":
             raise InvalidInput(f'Fit.report: `path` must end in ".html", got {str(path)!r}')
+        functions = self._functions("Fit.report")
         write_page(
             file,
             Page(
                 names=self.names,
                 values=self.values,
                 first=next(s.first for s in self.starts if np.isfinite(s.cost)),
-                intervals=self.intervals,
+                intervals={name: self._interval_text(name) for name in self.names},
                 correlation=self.correlation,
                 unidentifiable=[str(direction) for direction in self.unidentifiable],
                 collinear=[str(pair) for pair in self.collinear],
@@ -351,7 +444,7 @@ class Fit:
                 starts=self.starts,
                 history=self.history,
                 held_out=self.held_out,
-                residuals=self.compared,
+                residuals=functions,
             ),
         )
 
@@ -462,36 +555,45 @@ def fit(
     firsts = [space.first] + [space.draw(generator) for _ in range(starts - 1)]
     with nullcontext() if job.folder is None else locked("fit: `resume`", job.folder):
         ends = run_all(job, firsts, workers, deadline, progress)
-    best = min(ends, key=lambda end: end.cost)
+    best = _best(ends)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
-    noise = noise_of(best.residuals, len(space), loss, job.options.loss_scale)
     assert best.layout is not None  # it has residuals
     # Where a solver has stopped early, residuals show the way that is left, and no noise.
     correlated = best.success and are_correlated(best.residuals, best.layout)
+    values = space.values(torch.from_numpy(np.array(best.theta)))
+    solved = Solved(
+        space=space,
+        options=job.options,
+        ends=ends,
+        robust=covariance == "robust" or (covariance == "auto" and correlated),
+        held_out=[] if hold_out is None else _errors(hold_out, values),
+    )
+    compared = [r for r in (job.stages[-1].residuals, hold_out) if r is not None]
+    found = _assemble(solved, compared)
+    if found.success:
+        warn_of_blocks(found.blocks, found.noise_model, correlated=correlated)
+    _warn_of_bounds(space, found.at_bounds)
+    return found
+
+
+def _best(ends: Sequence[End]) -> End:
+    return min(ends, key=lambda end: end.cost)
+
+
+def _assemble(solved: Solved, compared: list[Residuals]) -> Fit:
+    """What follows from the ends of all starts."""
+    space, options, best = solved.space, solved.options, _best(solved.ends)
+    noise = noise_of(best.residuals, len(space), options.loss, options.loss_scale)
+    assert best.layout is not None  # it has residuals
     noise_model, spread = "white noise", None
-    if covariance == "robust" or (covariance == "auto" and correlated):
-        influence = _influence(best.residuals, loss, job.options.loss_scale)
+    if solved.robust:
+        influence = _influence(best.residuals, options.loss, options.loss_scale)
         noise_model, spread, noise = _robust(influence, best.layout, noise, len(space))
     found = uncertainty_of(space, best.theta, best.jacobian, noise, spread)
     leverage = leverages(space, best.theta, best.jacobian)
-    blocks = blocks_of_fit(best.residuals, best.layout, leverage, loss)
-    if best.success:
-        warn_of_blocks(blocks, noise_model, correlated=correlated)
     at_bounds = space.at_bounds(best.theta)
-    _warn_of_bounds(space, at_bounds)
-    values = space.values(torch.from_numpy(np.array(best.theta)))
-    linearized = Linearized(
-        space=space,
-        theta=best.theta,
-        residuals=best.residuals,
-        jacobian=best.jacobian,
-        weights=weights_of(best.residuals, loss, job.options.loss_scale)[0],
-        half_widths=found.half_widths,
-        covariance=found.of_theta,
-        precision_root=found.precision_root,
-        reach=found.reach,
-    )
+    values = Values(space.values(torch.from_numpy(np.array(best.theta))))
     return Fit(
         parameters=parameters_of(values),
         values=values,
@@ -501,20 +603,44 @@ def fit(
         intervals=found.intervals,
         unidentifiable=found.unidentifiable,
         collinear=found.collinear,
-        blocks=blocks,
+        blocks=blocks_of_fit(best.residuals, best.layout, leverage, options.loss),
         noise_model=noise_model,
         residuals=best.residuals,
         cost=best.cost,
         success=best.success,
         message=best.message + "".join(f"; {name} is at its bound" for name in at_bounds),
         at_bounds=at_bounds,
-        starts=judge(job, ends, best, found.deviations),
-        held_out=[] if hold_out is None else _errors(hold_out, values),
-        history=[trial for end in ends for trial in end.history],
-        compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
-        linearized=linearized,
-        job=job,
+        starts=judge(space, solved.ends, best, found.deviations),
+        held_out=solved.held_out,
+        history=[trial for end in solved.ends for trial in end.history],
+        compared=compared,
+        linearized=Linearized(
+            space=space,
+            theta=best.theta,
+            residuals=best.residuals,
+            jacobian=best.jacobian,
+            weights=weights_of(best.residuals, options.loss, options.loss_scale)[0],
+            half_widths=found.half_widths,
+            covariance=found.of_theta,
+            precision_root=found.precision_root,
+            reach=found.reach,
+        ),
+        solved=solved,
     )
+
+
+def _check_same(owner: str, residuals: Residuals, found: Fit) -> None:
+    """Refuse residuals that are not those of a fit."""
+    _check_signature(residuals, found.solved.space)
+    with torch.no_grad():
+        parts = trajectories(residuals, found.values)
+    now = torch.cat([part.reshape(-1) for part in parts]).to(torch.float64).numpy()
+    if now.shape != found.residuals.shape or not np.allclose(
+        now, found.residuals, rtol=_SAME, atol=_SAME
+    ):
+        raise InvalidInput(
+            f"{owner}: `residuals` must be those of the last stage of the fit, got other numbers"
+        )
 
 
 def _influence(residuals: FloatArray, loss: str, scale: float) -> FloatArray:

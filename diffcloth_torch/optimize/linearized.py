@@ -12,6 +12,7 @@ from diffcloth_torch.optimize.variables import Space
 
 __all__ = ["Linearized"]
 
+_UNTOLD = 1e3  # factor, or sizes, to both sides of a number of which nothing is known
 _SINGULAR = 1e-12  # singular values below this share of the largest belong to no known direction
 
 
@@ -56,6 +57,13 @@ class Linearized:
         step = np.zeros(len(space))
         step[free] = -units * np.linalg.lstsq(rows, right, rcond=_SINGULAR)[0]
         return np.clip(at + step, space.low, space.high) - at
+
+    @property
+    def untold(self) -> list[str]:
+        """Names of the numbers of which nothing is known: half widths of a thousand sizes."""
+        sizes = self.half_widths / self.space.units(self.theta)
+        limits = self.space.reach(_UNTOLD)
+        return [name for name, far in zip(self.space.names, ~(sizes < limits), strict=True) if far]
 
     @property
     def held(self) -> NDArray[np.bool_]:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.optimize.linearized import Linearized
-from diffcloth_torch.optimize.methods import solve
-from diffcloth_torch.optimize.problem import FAILURES, Memory, Problem
-from diffcloth_torch.optimize.starts import Job
+from diffcloth_torch.optimize.methods import Options, solve
+from diffcloth_torch.optimize.problem import FAILURES, Memory, Problem, Residuals
+from diffcloth_torch.optimize.variables import Space
 
 __all__ = ["Profile", "profile_of"]
 
@@ -40,15 +40,18 @@ class Profile:
     interval: tuple[float, float]
 
 
-def profile_of(job: Job, model: Linearized, cost: float, row: int) -> Profile:
+def profile_of(
+    residuals: Residuals, options: Options, model: Linearized, cost: float, row: int
+) -> Profile:
     """Walk to both sides of the solution, with the other numbers fitted again at each point.
 
     The rise is scaled so that a cost that is quadratic has the interval of the linear model.
 
     Args:
-        job: The fit.
-        model: Its linear model at the solution.
-        cost: Its cost there.
+        residuals: Those of the last stage of the fit.
+        options: How the other numbers are fitted.
+        model: The linear model at the solution.
+        cost: The cost there.
         row: Row of theta.
     """
     space, half = model.space, float(model.half_widths[row])
@@ -69,7 +72,7 @@ def profile_of(job: Job, model: Linearized, cost: float, row: int) -> Profile:
         for _ in range(_MOST):
             value = at[row] + sign * step
             value = max(value, bound) if sign < 0 else min(value, bound)
-            found = _lowest(job, at, row, others, value)
+            found = _lowest(residuals, options, space, at, row, others, value)
             if found is None:
                 break
             at, lowest = found
@@ -94,13 +97,19 @@ def profile_of(job: Job, model: Linearized, cost: float, row: int) -> Profile:
 
 
 def _lowest(
-    job: Job, at: FloatArray, row: int, others: NDArray[np.int64], value: float
+    residuals: Residuals,
+    options: Options,
+    space: Space,
+    at: FloatArray,
+    row: int,
+    others: NDArray[np.int64],
+    value: float,
 ) -> tuple[FloatArray, float] | None:
     """Theta with the lowest cost at a value of one number, and the cost; None if it fails."""
-    space, there = job.space, _with(at, row, value)
+    there = _with(at, row, value)
     problem = Problem(
         space,
-        job.stages[-1].residuals,
+        residuals,
         at=there,
         rows=others if len(others) else np.array([row], dtype=np.int64),
         start=0,
@@ -114,7 +123,7 @@ def _lowest(
             found = problem.residuals(there)
             return there, 0.5 * float(found @ found)
         problem.require(there[others])
-        end = solve(problem, there[others], space.low[others], space.high[others], job.options)
+        end = solve(problem, there[others], space.low[others], space.high[others], options)
     except FAILURES:
         return None
     there[others] = end.theta

@@ -212,9 +212,8 @@ def _work(job: Job, start: tuple[int, FloatArray]) -> End:
         torch.set_num_threads(before)
 
 
-def judge(job: Job, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
+def judge(space: Space, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
     """Say of each end whether it is at the best place, and if not, why."""
-    space = job.space
     return [
         Start(
             first=space.values(torch.from_numpy(end.first.copy())),

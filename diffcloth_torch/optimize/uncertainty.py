@@ -25,6 +25,7 @@ __all__ = [
 
 # Standard error of a direction, in sizes of its variables, from which on it is not known at all.
 _UNSURE = 1.0
+_NOTHING = 1e6  # the same, above which only its rounding is known
 _SHOWN = 0.1  # share of a direction below which a variable is not named
 _CONFIDENCE = 0.95
 _COLLINEAR = 0.1  # error if the others were known, over the error, below which a number is named
@@ -51,6 +52,8 @@ class Direction:
     def __str__(self) -> str:
         """Name the variables and their signs."""
         parts = [f"{share:+.2f} {name}" for name, share in self.shares.items()]
+        if not self.standard_error < _NOTHING:
+            return f"{' '.join(parts)} (not seen in the observations at all)"
         return f"{' '.join(parts)} (standard error {self.standard_error:.2g})"
 
 

@@ -28,11 +28,12 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
 
-__all__ = ["Prior", "Space", "Tie", "Variable"]
+__all__ = ["Prior", "Space", "Tie", "Values", "Variable"]
 
 _SCALES = ("log", "linear")
 _SPREADS = Range(1.0)
 _AT_BOUND = 1e-6  # of theta
+_SHOWN = 20  # numbers that are printed one by one
 _REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
 
 
@@ -136,6 +137,22 @@ class Prior:
         object.__setattr__(self, "covariance", matrix)
 
 
+class Values(dict[str, Tensor]):
+    """Values of variables by name; prints six digits of each number."""
+
+    def __repr__(self) -> str:
+        return "{" + ", ".join(f"{name!r}: {_digits(v)}" for name, v in self.items()) + "}"
+
+
+def _digits(value: Tensor) -> str:
+    if not value.dim():
+        return f"{float(value):.6g}"
+    if value.numel() > _SHOWN:
+        low, high = float(value.min()), float(value.max())
+        return f"{list(value.shape)} numbers from {low:.6g} to {high:.6g}"
+    return "[" + ", ".join(map(_digits, value.unbind())) + "]"
+
+
 @dataclass(frozen=True, eq=False)
 class _Axis:
     """A variable that is searched, and its rows in the vector of all numbers."""
@@ -155,6 +172,8 @@ class Space:
     """Vectors of numbers theta, one for each number of the free variables.
 
     Attributes:
+        given: Name -> variable.
+        priors: Priors of several variables.
         all_variables: Names of all variables, in their order.
         variables: Names of the free variables.
         names: Name of each number, as "stretch" or "velocity[0]".
@@ -190,6 +209,7 @@ class Space:
                 raise TypeError(
                     f"fit: variables[{name!r}] must be a Variable, got {type(variable).__name__}"
                 )
+        self.given, self.priors = dict(variables), tuple(priors)
         self.all_variables = tuple(variables)
         self._ties = {n: v for n, v in variables.items() if isinstance(v, Tie)}
         given = {n: v for n, v in variables.items() if isinstance(v, Variable)}
@@ -309,6 +329,14 @@ class Space:
             if axis.log:
                 numbers[axis.rows] = np.exp(theta[axis.rows])
         return numbers
+
+    def reach(self, factor: float) -> FloatArray:
+        """Distance of theta that is a factor on the scale "log", else as many sizes."""
+        distances = np.full(len(self), factor)
+        for axis in self._axes:
+            if axis.log:
+                distances[axis.rows] = math.log(factor)
+        return distances
 
     def units(self, theta: FloatArray) -> FloatArray:
         """What counts as a change of each theta by its own size."""

@@ -77,7 +77,7 @@ PUBLIC = {
     "load_config": "",
     "render": "",
     "show": "",
-    "Fit": "chi2 information mesh_bias predict profile report rms step_bias",
+    "Fit": "chi2 information lines load mesh_bias predict profile report rms save step_bias",
     "Stage": "",
     "fit": "",
     "Variable": "",
