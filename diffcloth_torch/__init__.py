@@ -34,11 +34,16 @@ if TYPE_CHECKING:
     from diffcloth_torch.errors import (
         AddedMassWarning,
         BarrierStartWarning,
+        CorrelatedResidualsWarning,
         InfeasibleMotion,
         IntersectingState,
         InvalidInput,
+        MeshBiasWarning,
+        ModelErrorWarning,
+        NoiseWarning,
         NotConverged,
         SimulationError,
+        StepBiasWarning,
         TurnedTooFar,
         WorkerError,
     )
@@ -54,7 +59,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize.descent import Descent, descend
     from diffcloth_torch.optimize.evaluation import Evaluation
     from diffcloth_torch.optimize.fit import Fit, Stage, fit
-    from diffcloth_torch.optimize.variables import Variable
+    from diffcloth_torch.optimize.variables import Prior, Tie, Variable
     from diffcloth_torch.sim.half_step import at_half_step
     from diffcloth_torch.sim.records.contact_points import ContactPoints
     from diffcloth_torch.sim.records.controls import Control, Parameters
@@ -76,6 +81,7 @@ __all__ = [
     "ContactOptions",
     "ContactPoints",
     "Control",
+    "CorrelatedResidualsWarning",
     "DeformingBody",
     "Descent",
     "Evaluation",
@@ -84,8 +90,12 @@ __all__ = [
     "IntersectingState",
     "InvalidInput",
     "Material",
+    "MeshBiasWarning",
+    "ModelErrorWarning",
+    "NoiseWarning",
     "NotConverged",
     "Parameters",
+    "Prior",
     "Report",
     "RigidBody",
     "Robot",
@@ -95,6 +105,8 @@ __all__ = [
     "SolverOptions",
     "Stage",
     "State",
+    "StepBiasWarning",
+    "Tie",
     "Trajectory",
     "TurnedTooFar",
     "Variable",
@@ -126,11 +138,16 @@ _HOMES = {
     "errors": (
         "AddedMassWarning",
         "BarrierStartWarning",
+        "CorrelatedResidualsWarning",
         "InfeasibleMotion",
         "IntersectingState",
         "InvalidInput",
+        "MeshBiasWarning",
+        "ModelErrorWarning",
+        "NoiseWarning",
         "NotConverged",
         "SimulationError",
+        "StepBiasWarning",
         "TurnedTooFar",
         "WorkerError",
     ),
@@ -145,7 +162,7 @@ _HOMES = {
     "optimize.descent": ("Descent", "descend"),
     "optimize.evaluation": ("Evaluation",),
     "optimize.fit": ("Fit", "Stage", "fit"),
-    "optimize.variables": ("Variable",),
+    "optimize.variables": ("Prior", "Tie", "Variable"),
     "sim.half_step": ("at_half_step",),
     "sim.records.contact_points": ("ContactPoints",),
     "sim.records.controls": ("Control", "Parameters"),

@@ -11,12 +11,17 @@ from typing import Any
 __all__ = [
     "AddedMassWarning",
     "BarrierStartWarning",
+    "CorrelatedResidualsWarning",
     "InadmissibleMaterial",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
+    "MeshBiasWarning",
+    "ModelErrorWarning",
+    "NoiseWarning",
     "NotConverged",
     "SimulationError",
+    "StepBiasWarning",
     "TurnedTooFar",
     "WorkerError",
 ]
@@ -82,6 +87,26 @@ class AddedMassWarning(UserWarning):
 
 class BarrierStartWarning(UserWarning):
     """Surfaces start so deep in the barrier that it throws them apart; the message names them."""
+
+
+class StepBiasWarning(UserWarning):
+    """The time step shifts fitted numbers by more than the half width of their intervals."""
+
+
+class MeshBiasWarning(UserWarning):
+    """The mesh shifts fitted numbers by more than the half width of their intervals."""
+
+
+class ModelErrorWarning(UserWarning):
+    """Residuals of a fit are too large for their noise: its intervals need not hold the truth."""
+
+
+class NoiseWarning(UserWarning):
+    """Residuals of a fit are too small for the noise that was given."""
+
+
+class CorrelatedResidualsWarning(UserWarning):
+    """Residuals of a fit are correlated along their series, and its intervals account for it."""
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:

@@ -248,19 +248,23 @@ class World:
     def found(self):
         return self.descent()
 
-    @property
-    def fitting(self):
+    @cached_property
+    def residual(self):
         seen = self.states.positions
 
         def residual(values):
             states = self.hung.rollout(self.hung.initial_state(), parameters=values, steps=3)
             return residuals.markers(states, seen, noise=1e-3)
 
+        return residual
+
+    @property
+    def fitting(self):
         free = {
             "stretch": dc.Variable(500.0, scale="log"),
             "gravity": dc.Variable([0.0, 0.0, -9.0]),
         }
-        return call(dc.fit, free, residual, max_evaluations=3)
+        return call(dc.fit, free, self.residual, max_evaluations=3)
 
     @cached_property
     def fit(self):
@@ -291,6 +295,12 @@ class World:
 
     def positions(self, robot):
         return f64([0.01] * len(robot.joint_names))
+
+
+def fit_loading(w):
+    path = w.folder / "kept_fit.pt"
+    w.fit.save(path)
+    return call(dc.Fit.load, path, w.residual)
 
 
 def saving(w):
@@ -336,6 +346,16 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "Evaluation.is_better_than": lambda w: call(w.found.best.is_better_than, w.found.first),
     "Evaluation.record": lambda w: call(w.found.best.record),
     "Fit": lambda w: record(dc.Fit, w.fit),
+    "Fit.lines": lambda w: call(w.fit.lines),
+    "Fit.load": fit_loading,
+    "Fit.save": lambda w: call(w.fit.save, w.folder / "fit.pt"),
+    "Fit.mesh_bias": lambda w: call(w.fit.mesh_bias, w.residual, order=2.0),
+    "Fit.step_bias": lambda w: call(w.fit.step_bias, w.residual, max_evaluations=1),
+    "Fit.information": lambda w: call(w.fit.information, w.residual),
+    "Fit.predict": lambda w: call(w.fit.predict, lambda p: p.gravity),
+    "Fit.profile": lambda w: call(w.fit.profile, "stretch"),
+    "Prior": lambda w: call(dc.Prior, {"stretch": 500.0, "bending": 1e-4}, np.eye(2)),
+    "Tie": lambda w: call(dc.Tie, "stretch", 1.2),
     "Fit.report": lambda w: call(w.fit.report, w.folder / "fit.html"),
     "Material": lambda w: call(dc.Material, 100.0, 1e-5, 0.3, density=0.2, stretch_weft=90.0),
     "Material.per_face": lambda w: call(dc.Material().per_face, "stretch"),
@@ -408,6 +428,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "State.replace": lambda w: call(w.state.replace, time=f64(1.0)),
     "Trajectory.__getitem__": lambda w: call(w.states.__getitem__, slice(1, None)),
     "Trajectory": lambda w: call(dc.Trajectory, list(w.states)),
+    "Trajectory.at": lambda w: call(w.states.at, w.states.time),
     "Trajectory.detach": lambda w: call(w.states.detach),
     "Trajectory.load": lambda w: call(dc.Trajectory.load, w.saved),
     "Trajectory.save": lambda w: call(w.states.save, w.folder / "states.pt"),
@@ -525,6 +546,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "learn.evaluate": lambda w: call(dc.learn.evaluate, w.make_env, "scripted", 2, 1),
     "learn.load_policy": lambda w: call(dc.learn.load_policy, w.kept[1]),
     "robots.panda": lambda w: call(dc.robots.panda),
+    "residuals.extrapolated": lambda w: call(
+        residuals.extrapolated, w.residual, w.residual, ratio=2.0
+    ),
     "residuals.markers": lambda w: call(
         residuals.markers, w.states, np.zeros((3, 12, 3)), np.ones((3, 12)), noise=0.1
     ),

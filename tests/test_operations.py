@@ -138,6 +138,7 @@ WITHOUT_REFUSAL = {
     "Evaluation",
     "Evaluation.record",
     "Fit",
+    "Fit.lines",
     "Parameters",
     "Parameters.replace",
     "Simulator.parameters",

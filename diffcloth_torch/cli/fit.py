@@ -81,8 +81,8 @@ def _run(task: Identify, out: Path) -> str:
         try:
             found = fit(
                 task.variables(),
-                task.observed,
-                hold_out=task.held_out if len(task.held_out) else None,
+                task.residuals(),
+                hold_out=task.hold_out(),
                 resume=out / _EVALUATIONS,
                 progress=bar.show,
                 **task.options(),
@@ -92,15 +92,26 @@ def _run(task: Identify, out: Path) -> str:
                 f"after {bar.count} evaluations, which are kept: go on with  "
                 f"diffcloth fit --resume {out}"
             ) from error
-    write_metrics(out / _RESULT, _record(task, found))
+    bias = _step_bias(task, found)
+    write_metrics(out / _RESULT, _record(task, found) | {"step_bias": bias})
     found.report(out / _PAGE)
-    lines = [
-        f"{name} {_number(found, k):.5g}, between {low:.5g} and {high:.5g}"
-        for k, (name, (low, high)) in enumerate(found.intervals.items())
+    lines = found.lines()
+    lines += [
+        f"a time step of zero would move {name} by {', '.join(f'{x:+.3g}' for x in shifts)}"
+        for name, shifts in (bias or {}).items()
     ]
     lines += [f"cannot be told apart: {direction}" for direction in found.unidentifiable]
+    lines += [f"nearly collinear: {pair}" for pair in found.collinear]
     lines += [f"start {k}: {start.apart}" for k, start in enumerate(found.starts) if start.apart]
     return "\n".join([*lines, f"{len(found.history)} evaluations; results are in {out}"])
+
+
+def _step_bias(task: Identify, found: Fit) -> dict[str, list[float]] | None:
+    """Shifts of each variable in the limit of a time step of zero; None if not estimated."""
+    if not task.checks_step:
+        return None
+    shifts = found.step_bias(task.finer(task.observed), order=task.order)
+    return {name: shift.reshape(-1).tolist() for name, shift in shifts.items()}
 
 
 def _record(task: Identify, found: Fit) -> dict[str, Any]:
@@ -114,6 +125,13 @@ def _record(task: Identify, found: Fit) -> dict[str, Any]:
         "intervals": {n: [*map(finite_or_none, ends)] for n, ends in found.intervals.items()},
         "covariance": [[*map(finite_or_none, row)] for row in found.covariance.tolist()],
         "unidentifiable": [str(direction) for direction in found.unidentifiable],
+        "collinear": [str(pair) for pair in found.collinear],
+        "noise_model": found.noise_model,
+        "rms": found.rms,
+        "blocks": {
+            name: {key: finite_or_none(value) for key, value in vars(block).items()}
+            for name, block in found.blocks.items()
+        },
         "held_out": found.held_out,
         "starts": [
             {
@@ -129,11 +147,6 @@ def _record(task: Identify, found: Fit) -> dict[str, Any]:
             for t in found.history
         ],
     }
-
-
-def _number(found: Fit, k: int) -> float:
-    free = dict.fromkeys(name.partition("[")[0] for name in found.names)
-    return [float(x) for name in free for x in found.values[name].flatten()][k]
 
 
 def _short(value: Tensor) -> str:

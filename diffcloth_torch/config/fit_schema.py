@@ -87,7 +87,11 @@ class TrajectorySection(Section):
 
 
 class FitSection(Section):
-    """Variables by name, trajectories, and the options of `fit`."""
+    """Variables by name, trajectories, and the options of `fit`.
+
+    `extrapolate` fits residuals that are extrapolated to a time step of zero, from the time steps
+    dt and dt / 2. Otherwise `step_check` estimates the bias of the time step after the fit.
+    """
 
     variables: Annotated[dict[str, VariableSection], Len(1)]
     trajectories: Annotated[list[TrajectorySection], Len(1)]
@@ -100,11 +104,25 @@ class FitSection(Section):
     loss_scale: Positive = 1.0
     max_evaluations: Updates = 100
     tolerance: Positive = 1e-8
+    covariance: Literal["auto", "white", "robust"] = "auto"
+    extrapolate: bool = False
+    step_check: bool = True
 
     @model_validator(mode="after")
     def _check_trajectories(self) -> FitSection:
         if all(trajectory.hold_out for trajectory in self.trajectories):
             raise ValueError("must have a trajectory without `hold_out` in `trajectories`")
+        return self
+
+    @model_validator(mode="after")
+    def _check_extrapolation(self) -> FitSection:
+        if self.extrapolate and all(trajectory.equilibrium for trajectory in self.trajectories):
+            raise ValueError("has `extrapolate: true` and must have a trajectory with `steps`")
+        if self.extrapolate and any(t.kind != "markers" for t in self.trajectories):
+            raise ValueError(
+                "has `extrapolate: true`, so that all `trajectories` must be of the kind "
+                "`markers`: residuals of an `outline` are not linear in positions"
+            )
         return self
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.autograd.transforms import numbers_of
@@ -26,6 +27,7 @@ from diffcloth_torch.sim.records.state import State, check_state
 
 __all__ = [
     "Comparison",
+    "blocks_of",
     "check_count_of",
     "checked_noise",
     "checked_points",
@@ -48,6 +50,7 @@ class Comparison:
         placed: The observed ones beside the states: an outline that was turned lies as they do.
         labels: Name of each point of a frame: its vertex, direction or number.
         noise: Standard deviation of an observation [m].
+        used: Of markers, coordinates that have a residual, shape [T, n, 3]; else None.
     """
 
     kind: str
@@ -57,6 +60,7 @@ class Comparison:
     placed: list[FloatArray]
     labels: list[str]
     noise: float
+    used: NDArray[np.bool_] | None = None
 
 
 _NOTES: ContextVar[list[Comparison] | None] = ContextVar("_NOTES", default=None)
@@ -78,6 +82,26 @@ def note(comparison: Comparison) -> None:
     notes = _NOTES.get()
     if notes is not None:
         notes.append(comparison)
+
+
+def blocks_of(owner: str, found: object) -> dict[str, Tensor]:
+    """The blocks that a residual function returned: name -> tensor, whose first axis is time.
+
+    Raises:
+        TypeError: If it returned something else than a tensor, a list of tensors, or a dict of
+            name -> tensor.
+    """
+    if isinstance(found, Tensor):
+        return {"residuals": found}
+    if isinstance(found, list | tuple):
+        found = {f"trajectory {k}": part for k, part in enumerate(found)}
+    if not isinstance(found, Mapping) or not all(
+        isinstance(name, str) and isinstance(part, Tensor) for name, part in found.items()
+    ):
+        raise TypeError(
+            f"{owner} must return a tensor, a list of tensors, or a dict of name -> tensor"
+        )
+    return dict(found)
 
 
 def positions_of(owner: str, states: Sequence[State]) -> Tensor:

@@ -18,7 +18,8 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import replace_file
 from diffcloth_torch.optimize.compared import Comparison, noting
-from diffcloth_torch.optimize.problem import Residuals, Trial, trajectories
+from diffcloth_torch.optimize.misfit import Block
+from diffcloth_torch.optimize.problem import Residuals, Trial, blocks_at
 from diffcloth_torch.optimize.starts import Start
 
 __all__ = ["Page", "write_page"]
@@ -37,14 +38,17 @@ td.text { text-align: left; } img { max-width: 100%; }
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """What the page shows; the fields are those of `Fit`."""
+    """What the page shows; the fields are those of `Fit`, with `intervals` as sentences."""
 
     names: list[str]
     values: Mapping[str, Tensor]
     first: Mapping[str, Tensor]
-    intervals: Mapping[str, tuple[float, float]]
+    intervals: Mapping[str, str]
     correlation: FloatArray
     unidentifiable: list[str]
+    collinear: list[str]
+    blocks: Mapping[str, Block]
+    noise_model: str
     rms: float
     message: str
     starts: Sequence[Start]
@@ -63,17 +67,22 @@ def write_page(path: Path, page: Page) -> None:
         f"{sum(bool(trial.failure) for trial in page.history)} of which failed.</p>",
         "<h2>Values</h2>",
         _values(page),
+        f"<p>The intervals are those of {page.noise_model}.</p>",
         *[f"<p>Cannot be told apart: {html.escape(text)}.</p>" for text in page.unidentifiable],
+        *[f"<p>Nearly collinear: {html.escape(text)}.</p>" for text in page.collinear],
+        "<h2>Residuals</h2>",
+        _blocks(page),
     ]
     if len(page.names) > 1:
         parts += ["<h2>Correlation</h2>", _correlation(page)]
-    for k, (before, after) in enumerate(zip(first, last, strict=True)):
-        parts += _trajectory(k, before, after)
+    for (title, before), (_, after) in zip(first, last, strict=True):
+        parts += _trajectory(title, before, after)
     if page.held_out:
         errors = ", ".join(f"{error:.3g}" for error in page.held_out)
         parts += [
             "<h2>Kept out of the fit</h2>",
-            f"<p>Root mean square of the residuals of each trajectory: {errors}.</p>",
+            "<p>Root mean square of the residuals of each trajectory, about one if the model is "
+            f"right: {errors}.</p>",
         ]
     parts += ["<h2>Cost</h2>", _image(lambda figure: _costs(figure, page), (7.0, 3.2), "Cost")]
     parts += ["<h2>Starts</h2>", _starts(page)]
@@ -87,21 +96,43 @@ def write_page(path: Path, page: Page) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def _compare(page: Page, values: Mapping[str, Tensor]) -> list[Comparison]:
-    with torch.no_grad(), noting() as notes:
-        for residuals in page.residuals:
-            trajectories(residuals, values)
-    return notes
+def _compare(page: Page, values: Mapping[str, Tensor]) -> list[tuple[str, Comparison]]:
+    """Titles and comparisons: of what was fitted, then of what was kept out."""
+    found = []
+    for kind, residuals in zip(("Fitted", "Kept out of the fit"), page.residuals, strict=False):
+        with torch.no_grad(), noting() as notes:
+            names = [*blocks_at(residuals, values)]
+        if len(names) != len(notes):
+            names = [f"comparison {k}" for k in range(len(notes))]
+        found += [(f"{kind}: {name}", n) for name, n in zip(names, notes, strict=True)]
+    return found
 
 
 def _values(page: Page) -> str:
     first = _numbers(page.first, page.names)
     last = _numbers(page.values, page.names)
     rows = [
-        [name, f"{a:.4g}", f"{b:.4g}", "{:.4g} to {:.4g}".format(*page.intervals[name])]
+        [name, f"{a:.6g}", f"{b:.6g}", page.intervals[name]]
         for name, a, b in zip(page.names, first, last, strict=True)
     ]
     return _table(["", "first", "found", "interval of 95 %"], rows)
+
+
+def _blocks(page: Page) -> str:
+    head = ["", "number", "root mean square", "chi2", "expected", "p-value", "autocorrelation"]
+    rows = [
+        [
+            name,
+            str(block.count),
+            f"{block.rms:.3g}",
+            f"{block.chi2:.4g}",
+            f"{block.freedom:.4g}",
+            "not known" if np.isnan(block.p_value) else f"{block.p_value:.2g}",
+            f"{block.autocorrelation:+.2f}",
+        ]
+        for name, block in page.blocks.items()
+    ]
+    return _table(head, rows)
 
 
 def _numbers(values: Mapping[str, Tensor], names: Sequence[str]) -> list[float]:
@@ -133,15 +164,20 @@ def _starts(page: Page) -> str:
     return _table(["start", *page.names, "cost", "evaluations", "where it ended"], rows)
 
 
-def _trajectory(k: int, first: Comparison, last: Comparison) -> list[str]:
+def _trajectory(title: str, first: Comparison, last: Comparison) -> list[str]:
     distances = _distances(last)
     by_point = np.sqrt(np.nanmean(distances**2, axis=0))
     worst = int(np.nanargmax(by_point))
+    noise = f"the noise was given as {1e3 * last.noise:.3g} mm"
+    if _coordinates(last) > 1:
+        noise += (
+            f" for each coordinate, which is sqrt({_coordinates(last)}) times as much, "
+            f"{1e3 * _expected(last):.3g} mm, for a distance"
+        )
     return [
-        f"<h2>Trajectory {k}: {last.kind.replace('_', ' ')}</h2>",
+        f"<h2>{html.escape(title)} ({last.kind.replace('_', ' ')})</h2>",
         f"<p>The worst is {last.labels[worst]}: {1e3 * by_point[worst]:.3g} mm on average, "
-        f"{1e3 * np.nanmax(distances[:, worst]):.3g} mm at most; the noise was given as "
-        f"{1e3 * last.noise:.3g} mm.</p>",
+        f"{1e3 * np.nanmax(distances[:, worst]):.3g} mm at most; {noise}.</p>",
         _image(lambda figure: _over_time(figure, first, last, worst), (7.0, 3.2), "Over time"),
         _image(lambda figure: _frames(figure, first, last), (9.0, 3.4), "Beside the observation"),
     ]
@@ -156,11 +192,34 @@ def _distances(compared: Comparison) -> FloatArray:
     return found
 
 
+def _coordinates(compared: Comparison) -> int:
+    """Coordinates of a point that have noise: an outline has it along its rays alone."""
+    return 1 if compared.kind == "outline" else 3
+
+
+def _expected(compared: Comparison) -> float:
+    """Root mean square that noise alone makes of a distance [m]."""
+    return compared.noise * float(np.sqrt(_coordinates(compared)))
+
+
+def _noise_band(compared: Comparison) -> FloatArray:
+    """Root mean square distance of each frame within which noise alone is in 95 %, [2, T]."""
+    from scipy.stats import chi2
+
+    counts = (~np.isnan(_distances(compared))).sum(axis=1) * _coordinates(compared)
+    shares = [[0.025], [0.975]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        band: FloatArray = _expected(compared) * np.sqrt(chi2.ppf(shares, counts) / counts)
+    return band
+
+
 def _over_time(figure: Any, first: Comparison, last: Comparison, worst: int) -> None:
     axes = figure.add_subplot()
     for compared, color, label in ((first, _FIRST, "first"), (last, _LAST, "found")):
         mean = np.sqrt(np.nanmean(_distances(compared) ** 2, axis=1))
         axes.plot(compared.times, 1e3 * mean, "o-", color=color, markersize=3, label=label)
+    low, high = 1e3 * _noise_band(last)
+    axes.fill_between(last.times, low, high, color=_OBSERVED, alpha=0.15, label="noise, 95 %")
     label = f"found, {last.labels[worst]}"
     axes.plot(last.times, 1e3 * _distances(last)[:, worst], ":", color=_LAST, label=label)
     axes.set_xlabel("time [s]")

@@ -25,6 +25,8 @@ from diffcloth_torch.checkpoint import (
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.compared import blocks_of, noting
+from diffcloth_torch.optimize.series import Layout, layout_of
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.sim.records.controls import Parameters
 
@@ -35,13 +37,14 @@ __all__ = [
     "Problem",
     "Residuals",
     "Trial",
+    "blocks_at",
     "parameters_of",
     "trajectories",
 ]
 
 _CHECKPOINT = "fit"  # kind of the files of evaluations
 
-Residuals = Callable[..., Tensor | Sequence[Tensor]]
+Residuals = Callable[..., Tensor | Sequence[Tensor] | Mapping[str, Tensor]]
 
 Failure = SimulationError | InadmissibleMaterial
 FAILURES = (SimulationError, InadmissibleMaterial)
@@ -153,15 +156,15 @@ class Problem:
         self._space, self._at, self._rows = space, torch.from_numpy(at.copy()), rows
         self._residuals, self._memory, self._report = residuals, memory, report
         self._start, self._stage, self._count = start, stage, 0
-        self._known = torch.from_numpy(np.flatnonzero(space.precisions[rows]))
-        self._means = torch.from_numpy(space.means[rows])[self._known]
-        self._precisions = torch.from_numpy(space.precisions[rows])[self._known]
+        self._means = torch.from_numpy(space.means)
+        self._whitening = torch.from_numpy(space.whitening)
+        self.layout: Layout | None = None
         self._last: tuple[bytes, FloatArray | Failure] | None = None
 
     @property
     def prior_count(self) -> int:
         """Number of the residuals, the last ones, that are those of priors."""
-        return len(self._known)
+        return len(self._whitening)
 
     def require(self, theta: FloatArray) -> None:
         """Evaluate at a start, where a failure ends it.
@@ -292,8 +295,11 @@ class Problem:
             )
 
     def _call(self, theta: Tensor) -> Tensor:
-        parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
-        return self._with_priors(parts, theta)
+        with noting() as compared:
+            blocks = blocks_at(self._residuals, self._space.values(self._whole(theta)))
+        if self.layout is None:
+            self.layout = layout_of(blocks, compared)
+        return self._with_priors(list(blocks.values()), theta)
 
     def _differentiated(self, theta: Tensor, *, backward: bool) -> Tensor:
         """The same, where a derivative is wanted; refuses residuals that have none."""
@@ -316,7 +322,7 @@ class Problem:
 
     def _with_priors(self, parts: Sequence[Tensor], theta: Tensor) -> Tensor:
         found = [part.reshape(-1).to(torch.float64) for part in parts]
-        return torch.cat([*found, (theta[self._known] - self._means) * self._precisions])
+        return torch.cat([*found, self._whitening @ (self._whole(theta) - self._means)])
 
     def _whole(self, theta: Tensor) -> Tensor:
         return self._at.index_copy(0, torch.from_numpy(self._rows), theta)
@@ -329,13 +335,15 @@ def parameters_of(values: Mapping[str, Tensor]) -> Parameters:
 
 def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Tensor]:
     """The residuals of each trajectory, at values of all variables."""
+    return list(blocks_at(residuals, values).values())
+
+
+def blocks_at(residuals: Residuals, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same by the name of each block."""
     others = {n: v for n, v in values.items() if n not in PARAMETERS}
     parameters = parameters_of(values)
     found = residuals(parameters, others) if others else residuals(parameters)
-    parts = [found] if isinstance(found, Tensor) else found
-    if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
-        raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
-    return list(parts)
+    return blocks_of("fit: `residuals`", found)
 
 
 def _has_tangent(part: Tensor) -> bool:

@@ -12,10 +12,13 @@ from torch import Tensor
 from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
+    POSITIVE,
+    FloatArray,
     check_finite,
     check_range,
     check_shape,
     float_array,
+    float_tensor,
     index_array,
 )
 from diffcloth_torch.errors import InvalidInput
@@ -28,10 +31,12 @@ from diffcloth_torch.optimize.compared import (
     positions_of,
     times_of,
 )
+from diffcloth_torch.optimize.extrapolation import extrapolated
 from diffcloth_torch.optimize.outlines import outline
 from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.trajectory import Trajectory
 
-__all__ = ["markers", "outline", "point_cloud"]
+__all__ = ["extrapolated", "markers", "outline", "point_cloud"]
 
 
 def markers(
@@ -40,30 +45,54 @@ def markers(
     weights: object = None,
     *,
     vertices: object = None,
-    noise: float = 1.0,
+    noise: object = 1.0,
+    times: object = None,
+    delay: Tensor | float = 0.0,
+    frame: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Positions of marked vertices less those observed, over the noise.
 
+    A camera sees the motion at times of its own, later by a delay, and in a frame of its own. Each
+    of these may be a variable of the fit:
+
+    >>> def residuals(parameters, values):
+    ...     frame = values["rotation"], values["translation"]
+    ...     states = dc.Trajectory([start, *simulate(parameters)])
+    ...     return dc.residuals.markers(
+    ...         states, seen, times=times, delay=values["delay"], frame=frame, noise=0.002
+    ...     )
+
     Args:
-        states: T states without a batch axis, one for each observation.
+        states: T states without a batch axis, one for each observation; with `times` a trajectory
+            that contains these times.
         observed: Positions [m], shape [T, m, 3]; NaN where a marker was not seen.
         weights: Weight of each marker, >= 0, shape [m] or [T, m]; 1 by default. One of zero was
             not seen.
         vertices: Indices of the m marked vertices; None means all.
-        noise: Standard deviation of an observation [m], > 0.
+        noise: Standard deviation of an observation [m], > 0: a number; one for each axis [3], for
+            each marker [m, 1] or for each frame [T, 1, 1]; or of each coordinate [T, m, 3].
+        times: Times of the observations [s], shape [T], on the clock of the camera; None where
+            each state is one observation. Positions are those of `Trajectory.at`.
+        delay: Time by which the camera's clock is late [s]: the motion is compared at
+            `times - delay`. Needs `times`.
+        frame: Rotation vector [rad], shape [3], and translation [m], shape [3], that bring
+            simulated positions into the frame of the camera: x_camera = R x + t.
 
     Returns:
-        Residuals [M] of what was seen, without unit; they have derivatives.
+        Residuals [M] of what was seen, without unit; they have derivatives, in `delay` and `frame`
+        too.
 
     Raises:
         InvalidInput: If a shape or value is not accepted.
     """
     owner = "residuals.markers"
-    positions = positions_of(owner, states)
+    positions, moments = _seen_positions(owner, states, times, delay)
     rows = None
     if vertices is not None:
         rows = index_array(f"{owner}: `vertices`", vertices, positions.shape[1])
         positions = positions[:, torch.from_numpy(rows.astype(np.int64))]
+    if frame is not None:
+        positions = _in_frame(owner, positions, frame)
     seen = float_array(f"{owner}: `observed`", observed)
     if seen.shape != tuple(positions.shape):
         raise InvalidInput(
@@ -72,7 +101,8 @@ def markers(
         )
     known = np.where(np.isnan(seen), 0.0, seen)
     check_finite(f"{owner}: `observed`, where it is not NaN,", known)
-    difference = (positions - torch.from_numpy(known)) / checked_noise(owner, noise)
+    scale = _noise_of_coordinates(owner, noise, seen.shape)
+    difference = (positions - torch.from_numpy(known)) / torch.from_numpy(scale)
     known_rows = ~np.isnan(seen)
     if weights is not None:
         given = float_array(f"{owner}: `weights`", weights)
@@ -85,15 +115,64 @@ def markers(
     note(
         Comparison(
             kind="markers",
-            times=times_of(states),
+            times=moments,
             simulated=list(numbers_of(positions)),
             observed=list(seen),
             placed=list(seen),
             labels=[f"vertex {i}" for i in marked],
-            noise=noise,
+            noise=float(np.sqrt(np.square(scale).mean())),
+            used=known_rows,
         )
     )
     return difference.flatten()[mask.flatten().nonzero()[:, 0]]
+
+
+def _seen_positions(
+    owner: str, states: Sequence[State], times: object, delay: Tensor | float
+) -> tuple[Tensor, FloatArray]:
+    """Positions [T, N, 3] at the moments of a camera, and these moments [s]."""
+    positions = positions_of(owner, states)
+    late = float_tensor(f"{owner}: `delay`", delay)
+    check_shape(f"{owner}: `delay`", late.shape, [()])
+    if times is None:
+        given: Any = delay
+        if isinstance(given, Tensor) or given != 0.0:
+            raise InvalidInput(f"{owner}: `delay` needs `times`, on whose clock it is late")
+        return positions, times_of(states)
+    clock = float_array(f"{owner}: `times`", times)
+    check_shape(f"{owner}: `times`", clock.shape, [("T",)])
+    check_finite(f"{owner}: `times`", clock)
+    moments = torch.from_numpy(clock) - late
+    return Trajectory(states).at(moments), numbers_of(moments)
+
+
+def _in_frame(owner: str, positions: Tensor, frame: tuple[Tensor, Tensor]) -> Tensor:
+    """Positions as a camera sees them, R x + t."""
+    given: Any = frame
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise InvalidInput(f"{owner}: `frame` must be (rotation, translation)")
+    vectors = []
+    for name, part in zip(("rotation", "translation"), given, strict=True):
+        vector = float_tensor(f"{owner}: the {name} of `frame`", part)
+        check_shape(f"{owner}: the {name} of `frame`", vector.shape, [(3,)])
+        vectors.append(vector)
+    rotation, translation = vectors
+    x, y, z = rotation.unbind()
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    # The exponential has derivatives where the rotation is none, too.
+    turn: Tensor = torch.linalg.matrix_exp(skew)
+    return positions @ turn.T + translation
+
+
+def _noise_of_coordinates(owner: str, noise: object, shape: tuple[int, ...]) -> FloatArray:
+    """Standard deviation of each coordinate [m]."""
+    given = float_array(f"{owner}: `noise`", noise)
+    frames, count, _ = shape
+    accepted = [(), (3,), (count, 1), (frames, 1, 1), shape]
+    check_shape(f"{owner}: `noise`", given.shape, accepted)
+    check_range(f"{owner}: `noise`", given, POSITIVE)
+    return np.broadcast_to(given, shape).copy()
 
 
 def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: float = 1.0) -> Tensor:

@@ -19,6 +19,7 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.methods import Options, solve
 from diffcloth_torch.optimize.problem import FAILURES, Failure, Memory, Problem, Residuals, Trial
+from diffcloth_torch.optimize.series import Layout
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.processes import Pool
 from diffcloth_torch.worker import note_progress
@@ -98,6 +99,7 @@ class End:
         success: Whether the solver converged in every stage.
         message: How it ended.
         history: Its evaluations.
+        layout: Blocks and series of the residuals.
         failure: The error of a failure.
     """
 
@@ -110,6 +112,7 @@ class End:
     success: bool
     message: str
     history: list[Trial]
+    layout: Layout | None
     failure: Failure | None
 
 
@@ -138,7 +141,7 @@ def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]
         except FAILURES as error:
             nothing = np.zeros(0)
             return End(
-                start, first, at, np.inf, nothing, nothing, False, str(error), history, error
+                start, first, at, np.inf, nothing, nothing, False, str(error), history, None, error
             )
         at = at.copy()
         at[rows] = end.theta
@@ -154,6 +157,7 @@ def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]
         success=success,
         message=end.message,
         history=history,
+        layout=problem.layout,
         failure=None,
     )
 
@@ -208,9 +212,8 @@ def _work(job: Job, start: tuple[int, FloatArray]) -> End:
         torch.set_num_threads(before)
 
 
-def judge(job: Job, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
+def judge(space: Space, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
     """Say of each end whether it is at the best place, and if not, why."""
-    space = job.space
     return [
         Start(
             first=space.values(torch.from_numpy(end.first.copy())),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,13 +11,30 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.optimize.variables import Space
 
-__all__ = ["Direction", "Noise", "Uncertainty", "noise_of", "uncertainty_of"]
+__all__ = [
+    "Collinear",
+    "Direction",
+    "Noise",
+    "Spread",
+    "Uncertainty",
+    "leverages",
+    "noise_of",
+    "uncertainty_of",
+    "weights_of",
+]
 
 # Standard error of a direction, in sizes of its variables, from which on it is not known at all.
 _UNSURE = 1.0
+_NOTHING = 1e6  # the same, above which only its rounding is known
 _SHOWN = 0.1  # share of a direction below which a variable is not named
 _CONFIDENCE = 0.95
+_COLLINEAR = 0.1  # error if the others were known, over the error, below which a number is named
+_KNOWN = 0.01  # standard error, in sizes of a number, below which it needs no naming
+_SINGULAR = 1e-12  # singular values below this share of the largest belong to no known direction
 _TINY = 1e-300
+
+Spread = Callable[[FloatArray], FloatArray]
+"""From directions U [M, p] to U^T C U [p, p], with the covariance C of the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +52,36 @@ class Direction:
     def __str__(self) -> str:
         """Name the variables and their signs."""
         parts = [f"{share:+.2f} {name}" for name, share in self.shares.items()]
+        if not self.standard_error < _NOTHING:
+            return f"{' '.join(parts)} (not seen in the observations at all)"
         return f"{' '.join(parts)} (standard error {self.standard_error:.2g})"
+
+
+@dataclass(frozen=True)
+class Collinear:
+    """A number that the observations tell almost only together with others.
+
+    Attributes:
+        name: The number.
+        other: The number with which it is correlated most.
+        correlation: Their correlation.
+        standard_error: Standard error of the number in its size: relative on the scale "log".
+        error_if_known: The same if all other numbers were known.
+    """
+
+    name: str
+    other: str
+    correlation: float
+    standard_error: float
+    error_if_known: float
+
+    def __str__(self) -> str:
+        """Describe the number and the other one."""
+        return (
+            f"{self.name} has a standard error of {self.standard_error:.2g}, of "
+            f"{self.error_if_known:.2g} if {self.other} were known "
+            f"(correlation {self.correlation:+.3f})"
+        )
 
 
 class Uncertainty(NamedTuple):
@@ -45,14 +92,24 @@ class Uncertainty(NamedTuple):
         correlation: Likewise.
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
+        collinear: Numbers that are known almost only together with another.
         deviations: Standard error of each theta [p].
+        half_widths: Half widths of the intervals of theta [p].
+        of_theta: Covariance of theta [p, p].
+        precision_root: Rows R with R^T R the inverse of this covariance.
+        reach: Half width of an interval of 95 % in standard errors.
     """
 
     covariance: FloatArray
     correlation: FloatArray
     intervals: dict[str, tuple[float, float]]
     unidentifiable: list[Direction]
+    collinear: list[Collinear]
     deviations: FloatArray
+    half_widths: FloatArray
+    of_theta: FloatArray
+    precision_root: FloatArray
+    reach: float
 
 
 class Noise(NamedTuple):
@@ -77,13 +134,27 @@ def noise_of(residuals: FloatArray, numbers: int, loss: str, scale: float) -> No
     freedom = len(residuals) - numbers
     if freedom < 1:
         return Noise(1.0, np.inf)
-    influence, slope = _influence(residuals, loss, scale)
+    weights, slope = weights_of(residuals, loss, scale)
+    influence = weights * residuals
     deviation = np.sqrt(float(influence @ influence) / freedom) / max(float(slope.mean()), _TINY)
     return Noise(float(deviation), freedom)
 
 
-def _influence(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
-    """Half the derivative of each square's loss, as SciPy has it, and its own derivative."""
+def leverages(space: Space, theta: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Share of each residual that the fitted numbers absorb [M]: the diagonal of J H^-1 J^T."""
+    units = space.units(theta)
+    rows = np.vstack([jacobian * units, space.whitening * units])
+    left, singular, _ = np.linalg.svd(rows, full_matrices=False)
+    known = singular > _SINGULAR * singular.max()
+    shares: FloatArray = np.square(left[: len(jacobian), known]).sum(axis=1)
+    return shares
+
+
+def weights_of(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Weights w of residuals r in the gradient of the cost, w r, and the derivatives of w r by r.
+
+    The losses are those of SciPy.
+    """
     z = np.square(residuals / scale)
     if loss == "linear":
         first, second = np.ones_like(z), np.zeros_like(z)
@@ -96,36 +167,85 @@ def _influence(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArr
         first, second = 1 / (1 + z), -1 / np.square(1 + z)
     else:
         first, second = 1 / (1 + z * z), -2 * z / np.square(1 + z * z)
-    return first * residuals, first + 2 * z * second
+    return first, first + 2 * z * second
 
 
 def uncertainty_of(
-    space: Space, theta: FloatArray, jacobian: FloatArray, found: Noise
+    space: Space, theta: FloatArray, jacobian: FloatArray, found: Noise, spread: Spread | None
 ) -> Uncertainty:
     """Standard errors at the solution, from the noise of the residuals and from the priors.
 
-    With the variance s^2 of the residuals and the precisions P of the priors, the covariance is
-    (J^T J / s^2 + P^2)^-1.
+    With the variance s^2 of white residuals and the precisions P of the priors, the covariance is
+    (J^T J / s^2 + P^2)^-1. With residuals of another covariance C it is
+    H^-1 (J^T C J + P^2) H^-1 with H = J^T J + P^2, the spread of the least squares.
     """
     noise = found.deviation
     # In sizes of the variables, so that directions compare.
     units = space.units(theta)
-    priors = np.diag(space.precisions * units)
-    _, singular, directions = np.linalg.svd(np.vstack([jacobian * units, priors * noise]))
-    spread = directions.T * (noise / np.maximum(singular, _TINY))
+    priors = space.whitening * units
+    scale = noise if spread is None else 1.0
+    # With zero rows, where residuals are fewer than numbers, no direction is left out.
+    rows = np.vstack([jacobian * units, priors * scale, np.zeros((len(space), len(space)))])
+    left, singular, directions = np.linalg.svd(rows, full_matrices=False)
+    if spread is None:
+        middle = noise**2 * np.eye(len(singular))
+    else:
+        data, known = left[: len(jacobian)], left[len(jacobian) :]
+        middle = spread(data) + known.T @ known
+        unknown = singular <= _SINGULAR * singular.max()
+        middle[unknown] = middle[:, unknown] = 0.0
+        middle[unknown, unknown] = 1.0
+    root = directions.T / np.maximum(singular, _TINY)
     with np.errstate(over="ignore", invalid="ignore"):
-        of_theta = units[:, None] * (spread @ spread.T) * units
+        of_theta = units[:, None] * (root @ middle @ root.T) * units
     rates = space.rates(theta)
     covariance = rates[:, None] * of_theta * rates
     deviations = np.sqrt(np.diag(covariance))
+    errors = np.sqrt(np.diag(of_theta))
     reach = _reach(found.freedom)
+    half_widths = reach * errors
+    correlation = _correlation(covariance, deviations)
+    with np.errstate(divide="ignore"):
+        alone = noise / np.linalg.norm(np.vstack([jacobian * units, priors * noise]), axis=0)
     return Uncertainty(
         covariance=covariance,
-        correlation=_correlation(covariance, deviations),
-        intervals=_intervals(space, theta, reach * np.sqrt(np.diag(of_theta))),
+        correlation=correlation,
+        intervals=_intervals(space, theta, half_widths),
         unidentifiable=_directions(space.names, jacobian * units, noise),
-        deviations=np.sqrt(np.diag(of_theta)),
+        collinear=_collinear(space.names, correlation, errors / units, alone),
+        deviations=errors,
+        half_widths=half_widths,
+        of_theta=of_theta,
+        precision_root=_inverse_root(middle) @ (singular[:, None] * directions / units),
+        reach=reach,
     )
+
+
+def _inverse_root(middle: FloatArray) -> FloatArray:
+    """Rows R with R^T R = M^-1; huge where M is zero, as where residuals show no noise.
+
+    The covariance V S^-1 M S^-1 V^T has the inverse Q^T Q with Q = R S V^T.
+    """
+    sizes, directions = np.linalg.eigh(middle)
+    root: FloatArray = (directions / np.sqrt(np.maximum(sizes, _TINY))).T
+    return root
+
+
+def _collinear(
+    names: list[str], correlation: FloatArray, errors: FloatArray, alone: FloatArray
+) -> list[Collinear]:
+    """Numbers that would be known ten times better if another were known."""
+    found = []
+    for i, name in enumerate(names):
+        if not (alone[i] < _COLLINEAR * errors[i] < np.inf and errors[i] > _KNOWN):
+            continue
+        others = np.abs(correlation[i])
+        others[i] = 0.0
+        k = int(others.argmax())
+        found.append(
+            Collinear(name, names[k], float(correlation[i, k]), float(errors[i]), float(alone[i]))
+        )
+    return sorted(found, key=lambda pair: pair.error_if_known / pair.standard_error)
 
 
 def _correlation(covariance: FloatArray, deviations: FloatArray) -> FloatArray:

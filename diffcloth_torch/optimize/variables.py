@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import (
+    ANY_NUMBER,
     POSITIVE,
     FloatArray,
     Range,
@@ -26,11 +28,12 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
 
-__all__ = ["Space", "Variable"]
+__all__ = ["Prior", "Space", "Tie", "Values", "Variable"]
 
 _SCALES = ("log", "linear")
 _SPREADS = Range(1.0)
 _AT_BOUND = 1e-6  # of theta
+_SHOWN = 20  # numbers that are printed one by one
 _REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
 
 
@@ -83,6 +86,74 @@ class Variable:
 
 
 @dataclass(frozen=True, eq=False)
+class Tie:
+    """A variable that follows another one, such as a weft that is 1.2 times as stiff as the warp.
+
+    Attributes:
+        of: Name of the variable that it follows, which is no tie.
+        by: Factor, or a function of the tensor of that variable; `workers` need one that can be
+            pickled.
+    """
+
+    of: str
+    by: float | Callable[[Tensor], Tensor] = 1.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.of, str):
+            raise TypeError(f"Tie: `of` must be a name, got {type(self.of).__name__}")
+        if not callable(self.by):
+            check_number("Tie: `by`", self.by, ANY_NUMBER)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known beforehand of several variables together: means and a covariance.
+
+    Attributes:
+        means: Name of each variable -> its mean, of the shape of its value.
+        covariance: Of all their numbers in the order of the names, symmetric and positive definite
+            [n, n]; of the natural logarithms of those on the scale "log".
+    """
+
+    means: Mapping[str, object]
+    covariance: object
+
+    def __post_init__(self) -> None:
+        given: Any = self.means
+        if not isinstance(given, Mapping) or not given:
+            raise TypeError("Prior: `means` must be a dict of one or more name -> mean")
+        means = {n: float_array(f"Prior: means[{n!r}]", v).copy() for n, v in self.means.items()}
+        for name, mean in means.items():
+            check_finite(f"Prior: means[{name!r}]", mean)
+        count = sum(mean.size for mean in means.values())
+        matrix = float_array("Prior: `covariance`", self.covariance).copy()
+        check_shape("Prior: `covariance`", matrix.shape, [(count, count)])
+        check_finite("Prior: `covariance`", matrix)
+        if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+            raise InvalidInput("Prior: `covariance` must be symmetric")
+        if np.linalg.eigvalsh(matrix)[0] <= 0.0:
+            raise InvalidInput("Prior: `covariance` must be positive definite")
+        object.__setattr__(self, "means", means)
+        object.__setattr__(self, "covariance", matrix)
+
+
+class Values(dict[str, Tensor]):
+    """Values of variables by name; prints six digits of each number."""
+
+    def __repr__(self) -> str:
+        return "{" + ", ".join(f"{name!r}: {_digits(v)}" for name, v in self.items()) + "}"
+
+
+def _digits(value: Tensor) -> str:
+    if not value.dim():
+        return f"{float(value):.6g}"
+    if value.numel() > _SHOWN:
+        low, high = float(value.min()), float(value.max())
+        return f"{list(value.shape)} numbers from {low:.6g} to {high:.6g}"
+    return "[" + ", ".join(map(_digits, value.unbind())) + "]"
+
+
+@dataclass(frozen=True, eq=False)
 class _Axis:
     """A variable that is searched, and its rows in the vector of all numbers."""
 
@@ -101,6 +172,8 @@ class Space:
     """Vectors of numbers theta, one for each number of the free variables.
 
     Attributes:
+        given: Name -> variable.
+        priors: Priors of several variables.
         all_variables: Names of all variables, in their order.
         variables: Names of the free variables.
         names: Name of each number, as "stretch" or "velocity[0]".
@@ -108,14 +181,17 @@ class Space:
         low: Lowest values of theta.
         high: Highest values of theta.
         means: Means of the priors, as theta; zero where there is none.
-        precisions: One over the standard deviations of the priors; zero where there is none.
+        whitening: Matrix P [k, p] that makes P (theta - means) the residuals of the priors.
     """
 
-    def __init__(self, variables: Mapping[str, Variable]) -> None:
+    def __init__(
+        self, variables: Mapping[str, Variable | Tie], priors: Sequence[Prior] = ()
+    ) -> None:
         """Lay out the free variables.
 
         Args:
             variables: Name -> variable.
+            priors: Priors of several variables.
 
         Raises:
             InvalidInput: If none is free.
@@ -129,18 +205,26 @@ class Space:
         for name, variable in variables.items():
             if not isinstance(name, str):
                 raise TypeError(f"fit: `variables` must have names as keys, got {name!r}")
-            if not isinstance(variable, Variable):
+            if not isinstance(variable, Variable | Tie):
                 raise TypeError(
                     f"fit: variables[{name!r}] must be a Variable, got {type(variable).__name__}"
                 )
+        self.given, self.priors = dict(variables), tuple(priors)
+        self.all_variables = tuple(variables)
+        self._ties = {n: v for n, v in variables.items() if isinstance(v, Tie)}
+        given = {n: v for n, v in variables.items() if isinstance(v, Variable)}
+        for name, tie in self._ties.items():
+            if tie.of not in given:
+                raise InvalidInput(
+                    f"fit: variables[{name!r}].of may name {', '.join(given)}; got {tie.of!r}"
+                )
         self._kept = {
             name: torch.from_numpy(_numbers(variable))
-            for name, variable in variables.items()
+            for name, variable in given.items()
             if not variable.free
         }
-        self.all_variables = tuple(variables)
         self._axes, self.names, first = [], [], 0
-        for name, variable in variables.items():
+        for name, variable in given.items():
             if variable.free:
                 axis = _axis(name, variable, first)
                 first = axis.rows.stop
@@ -149,24 +233,57 @@ class Space:
         if not self._axes:
             raise InvalidInput("fit: `variables` must have at least one that is free")
         self.variables = [axis.name for axis in self._axes]
-        self.first = np.concatenate(
-            [_to(axis, _numbers(variables[axis.name])) for axis in self._axes]
-        )
+        self.first = np.concatenate([_to(axis, _numbers(given[axis.name])) for axis in self._axes])
         counts = [axis.rows.stop - axis.rows.start for axis in self._axes]
         self.low = np.repeat([_bound(axis, axis.low) for axis in self._axes], counts)
         self.high = np.repeat([_bound(axis, axis.high) for axis in self._axes], counts)
-        self.means, self.precisions = np.zeros(len(self)), np.zeros(len(self))
+        self.means = np.zeros(len(self))
+        self._joint: list[tuple[NDArray[np.int64], FloatArray]] = []
+        for k, prior in enumerate(priors):
+            self._joint.append(self._placed(k, prior))
+        blocks: list[tuple[Any, FloatArray]] = []
         for axis in self._axes:
             if axis.prior is not None:
                 mean, deviation = axis.prior
                 self.means[axis.rows] = _to(axis, mean)
-                self.precisions[axis.rows] = 1 / deviation.reshape(-1)
+                blocks.append((axis.rows, np.diag(1 / deviation.reshape(-1))))
+        # With the Cholesky factor L of a covariance, residuals are L^-1 (theta - means).
+        for known, factor in self._joint:
+            blocks.append((known, np.asarray(np.linalg.inv(factor), dtype=np.float64)))
+        self.whitening = np.zeros((sum(len(block) for _, block in blocks), len(self)))
+        first = 0
+        for rows, block in blocks:
+            self.whitening[first : first + len(block), rows] = block
+            first += len(block)
+
+    def _placed(self, k: int, prior: Prior) -> tuple[NDArray[np.int64], FloatArray]:
+        """Rows of a prior of several variables, and the Cholesky factor of its covariance."""
+        if not isinstance(prior, Prior):
+            raise TypeError(f"fit: priors[{k}] must be a Prior, got {type(prior).__name__}")
+        axes = {axis.name: axis for axis in self._axes}
+        rows: list[int] = []
+        for name, mean in prior.means.items():
+            if name not in axes:
+                raise InvalidInput(
+                    f"fit: priors[{k}] may name {', '.join(axes)}, which are free; got {name!r}"
+                )
+            axis, numbers = axes[name], np.asarray(mean)
+            taken = any(axis.rows.start in known for known, _ in self._joint)
+            if axis.prior is not None or taken:
+                raise InvalidInput(f"fit: priors[{k}] names {name!r}, which has a prior already")
+            check_shape(f"fit: priors[{k}].means[{name!r}]", numbers.shape, [axis.shape])
+            if axis.log:
+                _check_positive(f"fit: priors[{k}].means[{name!r}]", numbers)
+            self.means[axis.rows] = _to(axis, numbers)
+            rows += range(axis.rows.start, axis.rows.stop)
+        return np.array(rows), np.linalg.cholesky(np.asarray(prior.covariance))
 
     def described(self) -> list[Any]:
         """What evaluations belong to, in types that `torch.load` reads."""
-        numbers = (self.low, self.high, self.means, self.precisions)
+        numbers = (self.low, self.high, self.means, self.whitening)
         kept = [[name, value.tolist()] for name, value in self._kept.items()]
-        return [list(self.names), kept, *(found.tolist() for found in numbers)]
+        ties = [[n, t.of, "function" if callable(t.by) else t.by] for n, t in self._ties.items()]
+        return [list(self.names), kept, ties, *(found.tolist() for found in numbers)]
 
     def __len__(self) -> int:
         """Count the numbers."""
@@ -183,7 +300,9 @@ class Space:
         for axis in self._axes:
             numbers = theta[axis.rows].reshape(axis.shape)
             free[axis.name] = numbers.exp() if axis.log else numbers
-        return {name: free.get(name, self._kept.get(name)) for name in self.all_variables}  # type: ignore[misc]
+        found = {**self._kept, **free}
+        found |= {name: _tied(tie, found[tie.of]) for name, tie in self._ties.items()}
+        return {name: found[name] for name in self.all_variables}
 
     def at_bounds(self, theta: FloatArray) -> list[str]:
         """Names of the numbers at their lowest or highest value."""
@@ -211,6 +330,14 @@ class Space:
                 numbers[axis.rows] = np.exp(theta[axis.rows])
         return numbers
 
+    def reach(self, factor: float) -> FloatArray:
+        """Distance of theta that is a factor on the scale "log", else as many sizes."""
+        distances = np.full(len(self), factor)
+        for axis in self._axes:
+            if axis.log:
+                distances[axis.rows] = math.log(factor)
+        return distances
+
     def units(self, theta: FloatArray) -> FloatArray:
         """What counts as a change of each theta by its own size."""
         units = np.ones(len(self))
@@ -227,7 +354,7 @@ class Space:
         for axis in self._axes:
             first, rows = self.first[axis.rows], axis.rows
             if axis.prior is not None:
-                drawn = generator.normal(self.means[rows], 1 / self.precisions[rows])
+                drawn = generator.normal(self.means[rows], axis.prior[1].reshape(-1))
                 theta[rows] = np.clip(drawn, self.low[rows], self.high[rows])
                 continue
             if axis.log:
@@ -239,6 +366,9 @@ class Space:
                 low, high = first - np.abs(first), first + np.abs(first)
             low, high = np.maximum(low, self.low[rows]), np.minimum(high, self.high[rows])
             theta[rows] = generator.uniform(low, high)
+        for known, factor in self._joint:
+            drawn = self.means[known] + factor @ generator.standard_normal(len(known))
+            theta[known] = np.clip(drawn, self.low[known], self.high[known])
         return theta
 
 
@@ -330,6 +460,10 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
         prior=prior,
         is_default=variable.bounds is None,
     )
+
+
+def _tied(tie: Tie, value: Tensor) -> Tensor:
+    return tie.by(value) if callable(tie.by) else tie.by * value
 
 
 def _to(axis: _Axis, numbers: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.optimize import residuals
 from diffcloth_torch.optimize.compared import noting
 from diffcloth_torch.optimize.outlines import silhouettes
+from diffcloth_torch.optimize.problem import Residuals
+from diffcloth_torch.optimize.starts import Stage
 from diffcloth_torch.optimize.variables import Variable
 from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State
@@ -48,15 +50,53 @@ class Identify(ConfiguredTask):
     def __init__(self, config: FitConfig, source: Path) -> None:
         """Build the scene of a configuration that was read from the file `source`."""
         super().__init__(config, source)
-        self._fit = config.fit
+        self._fit, self._fit_config, self._source = config.fit, config, source
         for name in config.fit.variables:
             _check_name(f"{source}: `fit.variables`", name)
         names = [section.name for section in config.fit.trajectories]
         if len(set(names)) < len(names):
             raise InvalidInput(f"{source}: `fit.trajectories` must have names that differ: {names}")
         trajectories = [_trajectory(config, section, source) for section in config.fit.trajectories]
-        self.observed = Observations([t for t, held_out in trajectories if not held_out])
-        self.held_out = Observations([t for t, held_out in trajectories if held_out])
+        self.observed = Observations([t for t in trajectories if not t.section.hold_out])
+        self.held_out = Observations([t for t in trajectories if t.section.hold_out])
+
+    @property
+    def checks_step(self) -> bool:
+        """Whether the bias of the time step is to be estimated: of motions seen by markers."""
+        if self._fit.extrapolate or not self._fit.step_check:
+            return False
+        sections = self._fit.trajectories
+        moves = not all(section.equilibrium for section in sections)
+        return moves and all(section.kind == "markers" for section in sections)
+
+    @property
+    def order(self) -> float:
+        """Power of the time step in the error of motions."""
+        return 2.0 if self.simulator.integrator == "second_order" else 1.0
+
+    def finer(self, observed: Observations) -> Observations:
+        """The same observations, compared with simulations with half the time step."""
+        return Observations(
+            [
+                replace(t, motion=_halved(self._fit_config, t, self._source))
+                for t in observed.trajectories
+            ]
+        )
+
+    def residuals(self) -> Residuals | list[Stage]:
+        """The residuals of `fit`; with `extrapolate` its stages, the first without."""
+        if not self._fit.extrapolate:
+            return self.observed
+        return [Stage(self.observed), Stage(self._extrapolated(self.observed))]
+
+    def hold_out(self) -> Residuals | None:
+        """The residuals of trajectories that are kept out of the fit."""
+        if not len(self.held_out):
+            return None
+        return self._extrapolated(self.held_out) if self._fit.extrapolate else self.held_out
+
+    def _extrapolated(self, observed: Observations) -> Residuals:
+        return residuals.extrapolated(observed, self.finer(observed), order=self.order)
 
     def variables(self) -> dict[str, Variable]:
         """Make the variables of the fit."""
@@ -74,7 +114,9 @@ class Identify(ConfiguredTask):
 
     def options(self) -> dict[str, Any]:
         """Give the options of `fit`."""
-        return self._fit.model_dump(exclude={"variables", "trajectories"})
+        return self._fit.model_dump(
+            exclude={"variables", "trajectories", "extrapolate", "step_check"}
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +143,8 @@ class _Motion:
             for pinned in self.task.scene.cloths[0].pins.values():
                 free[torch.from_numpy(pinned.astype(np.int64))] = 0.0
             assert parameters.gravity is not None  # the simulator sets it
-            # Implicit Euler lets gravity act for half a step too long before the first position.
+            # Implicit Euler lets gravity act for half a step too long before the first position;
+            # the second-order step takes the velocity of half a step earlier.
             late = 0.5 * simulator.dt * parameters.gravity
             start = start.replace(velocities=free * (velocity - late))
         controller = self.task.controller({})
@@ -150,31 +193,29 @@ class Observations:
     """The residuals of trajectories; can be sent to another process."""
 
     def __init__(self, trajectories: list[_Observed]) -> None:
-        self._trajectories = trajectories
+        self.trajectories = trajectories
 
     def __len__(self) -> int:
         """Count the trajectories."""
-        return len(self._trajectories)
+        return len(self.trajectories)
 
     def __call__(
         self, parameters: Parameters, values: Mapping[str, Tensor] | None = None
-    ) -> list[Tensor]:
-        """Give the residuals of each trajectory."""
+    ) -> dict[str, Tensor]:
+        """Return the residuals of each trajectory by its name."""
         given = {n: v for n, v in vars(parameters).items() if isinstance(v, Tensor)}
-        return [t.residuals(given | dict(values or {})) for t in self._trajectories]
+        return {t.section.name: t.residuals(given | dict(values or {})) for t in self.trajectories}
 
     def scenes(self) -> list[Scene]:
         """Give the scene of each trajectory."""
-        return [t.motion.task.scene for t in self._trajectories]
+        return [t.motion.task.scene for t in self.trajectories]
 
     def tracks(self, values: Mapping[str, Tensor]) -> list[Track]:
         """Simulate each trajectory at values of all variables, for a viewer."""
-        return [t.track(values) for t in self._trajectories]
+        return [t.track(values) for t in self.trajectories]
 
 
-def _trajectory(
-    config: FitConfig, section: TrajectorySection, source: Path
-) -> tuple[_Observed, bool]:
+def _trajectory(config: FitConfig, section: TrajectorySection, source: Path) -> _Observed:
     motion = _motion(config, section, section.changes, source, section.steps)
     cloth = motion.task.scene.cloths[0]
     vertices = list(range(len(cloth.vertices)))
@@ -186,7 +227,19 @@ def _trajectory(
     else:
         assert section.file is not None  # the schema requires one of the two
         seen = _read(resolve_path(source, config.root, section.file), section, len(vertices))
-    return _Observed(section, motion, vertices, seen), section.hold_out
+    return _Observed(section, motion, vertices, seen)
+
+
+def _halved(config: FitConfig, observed: _Observed, source: Path) -> _Motion:
+    """The same motion with half the time step."""
+    section, task = observed.section, observed.motion.task
+    changes = [
+        *section.changes,
+        f"simulation.dt={task.simulator.dt / 2!r}",
+        f"simulation.steps={2 * task.steps}",
+    ]
+    steps = None if section.steps is None else [2 * k for k in section.steps]
+    return _motion(config, section, changes, source, steps)
 
 
 def _motion(

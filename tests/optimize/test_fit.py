@@ -196,6 +196,8 @@ def test_starts_end_at_one_place_and_repeat(strip):
     assert len({float(first) for first in firsts}) == 3
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_outliers_count_less_with_a_robust_loss(strip):
     observed = observe(strip, 2, **TRUTH)
     mistaken = np.random.default_rng(5).choice(observed.shape[0] * 18, 12, replace=False)
@@ -299,8 +301,12 @@ class TestResiduals:
         (lambda: dc.fit(START, len, method="adam"), dc.InvalidInput, "least_squares"),
         (lambda: dc.fit(START, len, loss="cubic"), dc.InvalidInput, "soft_l1"),
         (lambda: dc.fit(START, len, starts=0), dc.InvalidInput, "`starts` must be at least 1"),
-        (lambda: dc.fit(START, lambda p: [1.0]), TypeError, "a tensor or a list of tensors"),
-        (lambda: dc.fit(START, lambda p: 1.0), TypeError, "a tensor or a list of tensors"),
+        (
+            lambda: dc.fit(START, lambda p: [1.0]),
+            TypeError,
+            "a tensor, a list of tensors, or a dict",
+        ),
+        (lambda: dc.fit(START, lambda p: 1.0), TypeError, "a list of tensors, or a dict"),
         (lambda: dc.Variable(1.0, bounds=(0, 1, 2)), dc.InvalidInput, "low < high"),
         (lambda: dc.Variable([]), dc.InvalidInput, "one or more numbers, got none"),
         (lambda: dc.Variable("1"), TypeError, "must hold real numbers"),

@@ -132,6 +132,8 @@ def test_a_stage_keeps_what_it_does_not_free_and_the_next_begins_there():
         assert float(found.values[name]) == pytest.approx(float(value), rel=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_what_is_held_out_is_not_fitted_and_its_error_is_that_of_the_noise():
     found = dc.fit(VARIABLES, residuals, hold_out=kept_out)
     assert len(found.residuals) == 20

@@ -45,7 +45,7 @@ def test_standard_errors_are_the_spread_of_fits_to_other_noise(loss):
         rng = np.random.default_rng(seed)
         noise = NOISE * rng.standard_normal(60)
         noise = np.where(rng.random(60) < outliers, 20 * noise, noise)
-        found = fit_to(TRUTH + torch.from_numpy(noise), loss=loss)
+        found = fit_to(TRUTH + torch.from_numpy(noise), loss=loss, covariance="white")
         values.append([float(v) for v in found.values.values()])
         errors.append(np.sqrt(np.diag(found.covariance)))
     # The spread of 60 fits is known to a tenth.
@@ -160,6 +160,8 @@ def test_a_report_begins_at_the_first_start_that_could_be_simulated(tmp_path):
 
 
 @pytest.mark.parametrize("first", [1e-4, 1e-3])
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_a_number_that_ends_at_a_bound_is_named(first):
     residuals = fit_to(TRUTH).compared[0]
     given = {"a": dc.Variable(2.0, bounds=(2.0, 9.0)), "b": dc.Variable(first, scale="log")}

@@ -32,6 +32,8 @@ def test_other_methods_end_at_the_same_place(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_they_stay_within_bounds(name):
     """The best offset is near -.3."""
     free = VARIABLES | {"offset": dc.Variable(0.0, bounds=(-0.1, 1))}

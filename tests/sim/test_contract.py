@@ -32,6 +32,7 @@ PUBLIC = {
         "joint_efforts base_poses base_wrenches attachments attachment_weights wind body_vertices "
         "replace"
     ),
+    "CorrelatedResidualsWarning": "",
     "DeformingBody": "load",
     "Descent": "record restore metrics",
     "Evaluation": "failed_environments is_better_than record",
@@ -42,7 +43,13 @@ PUBLIC = {
         "stretch bending poisson density damping friction thickness normal_drag tangential_drag "
         "stretch_weft stretch_shear bending_weft bending_twill is_orthotropic per_face"
     ),
+    "MeshBiasWarning": "",
+    "ModelErrorWarning": "",
+    "NoiseWarning": "",
     "NotConverged": "",
+    "Prior": "",
+    "StepBiasWarning": "",
+    "Tie": "",
     "TurnedTooFar": "",
     "Parameters": (
         "stretch bending poisson density damping friction thickness barrier_stiffness "
@@ -64,19 +71,19 @@ PUBLIC = {
     ),
     "SolverOptions": "tolerance max_iterations max_seconds throw metric elastic",
     "State": "batch_size replace detach clone to export meshes contact_forces pin_forces",
-    "Trajectory": "save load detach",
+    "Trajectory": "at save load detach",
     "build_info": "",
     "descend": "",
     "load_config": "",
     "render": "",
     "show": "",
-    "Fit": "report",
+    "Fit": "chi2 information lines load mesh_bias predict profile report rms save step_bias",
     "Stage": "",
     "fit": "",
     "Variable": "",
     "WorkerError": "",
     "at_half_step": "",
-    "residuals": "markers outline point_cloud",
+    "residuals": "extrapolated markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
     "fabrics": "MEASUREMENTS Measurement material",
     "learn": (

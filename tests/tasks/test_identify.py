@@ -84,6 +84,8 @@ SHORT = {
 @pytest.mark.quick("fit_cantilever", "fit_hang")
 @pytest.mark.rounding
 @pytest.mark.parametrize("name", SHORT)
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_what_is_known_is_found_on_a_coarser_mesh(name):
     changes, shares = SHORT[name]
     first = read_config(CONFIGS / f"{name}.yaml").fit.trajectories
@@ -101,7 +103,7 @@ def test_a_drape_is_fitted_wherever_its_folds_are():
     changes = ["scene.cloths.disk.shape.edge_length=0.02", "fit.trajectories.shadow.noise=1.0"]
     changes += ["fit.trajectories.shadow.synthetic.changes=[]", "fit.trajectories.0.directions=72"]
     task = load_task(CONFIGS / "fit_drape.yaml", changes)
-    trajectory = task.observed._trajectories[0]
+    trajectory = task.observed.trajectories[0]
     states = trajectory.motion.simulate({"bending": torch.tensor(3e-4, dtype=torch.float64)})
     faces = trajectory.motion.task.scene.cloths[0].faces
     rim = states[0].positions.numpy()[: round(2 * np.pi * 0.15 / 0.02), :2]
@@ -146,18 +148,69 @@ def test_observations_can_be_sent_to_a_process(config):
     task = load_task(config)
     copy = pickle.loads(pickle.dumps(task.observed))
     given = dc.Parameters(stretch=torch.tensor(30.0, dtype=torch.float64))
-    assert torch.equal(copy(given)[0], task.observed(given)[0])
+    (name,) = task.observed(given)
+    assert torch.equal(copy(given)[name], task.observed(given)[name])
 
 
 def test_observations_of_a_file_are_those_of_the_file(config):
-    seen = load_task(config).observed._trajectories[0].seen
+    seen = load_task(config).observed.trajectories[0].seen
     np.savez(config.with_name("seen.npz"), positions=seen)
     change = "fit.trajectories=[{name: rest, equilibrium: true, noise: 1e-3, file: seen.npz}]"
     task = load_task(config, [change])
-    np.testing.assert_array_equal(task.observed._trajectories[0].seen, seen)
+    np.testing.assert_array_equal(task.observed.trajectories[0].seen, seen)
     found = dc.fit(task.variables(), task.observed)
     low, high = found.intervals["stretch"]
     assert low < 40 < high
+
+
+FALL = [
+    "fit.covariance=white",
+    "simulation={dt: 0.01, steps: 16}",
+    "scene.cloths.sheet.pins.top={vertices: [0, 1, 2]}",
+    "scene.cloths.sheet.pose={}",
+    "scene.cloths.sheet.material.normal_drag=2.0",
+    "fit.variables={normal_drag: {value: 1.0}}",
+    "fit.trajectories=[{name: fall, steps: [4, 8, 12, 16], noise: 1e-4, synthetic: "
+    "{values: {normal_drag: 2.0}, changes: [simulation.dt=0.0005, simulation.steps=320]}}]",
+]
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+def test_the_bias_of_the_time_step_is_reported(config, tmp_path):
+    sets = [word for change in FALL for word in ("--set", change)]
+    out = tmp_path / "out"
+    with pytest.warns(dc.StepBiasWarning, match="normal_drag"):
+        ran = CliRunner().invoke(main, ["fit", str(config), *sets, "--out", str(out)])
+    assert not ran.exception, ran.output
+    assert "a time step of zero would move normal_drag by " in ran.output
+    record = json.loads((out / "fit.json").read_text())
+    (shift,) = record["step_bias"]["normal_drag"]
+    low, high = record["intervals"]["normal_drag"]
+    assert not low < 2.0 < high
+    assert record["values"]["normal_drag"] + shift == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+def test_extrapolated_configurations_are_fitted_without_the_bias(config):
+    task = load_task(config, [*FALL, "fit.extrapolate=true"])
+    found = dc.fit(task.variables(), task.residuals(), **task.options())
+    assert float(found.values["normal_drag"]) == pytest.approx(2.0, rel=0.05)
+    assert not task.checks_step
+    assert load_task(config, FALL).checks_step
+    assert not load_task(config, [*FALL, "fit.step_check=false"]).checks_step
+    assert not load_task(config).checks_step, "an equilibrium has no time step"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["fit.extrapolate=true"], "must have a trajectory with `steps`"),
+        ([*FALL, "fit.extrapolate=true", "fit.trajectories.fall.kind=outline"], "of the kind"),
+    ],
+)
+def test_what_cannot_be_extrapolated_is_refused(config, changes, message):
+    with pytest.raises(dc.InvalidInput, match=message):
+        load_task(config, changes)
 
 
 def test_an_outline_is_fitted(config):
@@ -185,7 +238,7 @@ def test_a_velocity_is_that_of_free_fall(config):
         "synthetic: {values: {velocity: [1.0, 0.0, 2.0]}}}]",
     ]
     task = load_task(config, changes)
-    motion = task.observed._trajectories[0].motion
+    motion = task.observed.trajectories[0].motion
     states = motion.simulate({"velocity": torch.tensor([1.0, 0.0, 2.0], dtype=torch.float64)})
     for state in states:
         t = float(state.time)

@@ -16,6 +16,8 @@ from diffcloth_torch import cpu
 from diffcloth_torch.animation.formats import ANIMATIONS
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
 from diffcloth_torch.autograd.torch_private import register_tree
+from diffcloth_torch.autograd.transforms import numbers_of
+from diffcloth_torch.checks import FloatArray, float_tensor
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, replace_file
 from diffcloth_torch.geometry.poses import poses_of_frames
@@ -25,6 +27,9 @@ from diffcloth_torch.sim.records.state import State, check_shapes, check_state
 __all__ = ["Trajectory", "check_ending"]
 
 _FILES = (".pt", ".npz")  # with data; the others are animations
+
+_ROUNDING = 1e-9  # of the largest time, by which a time may be outside
+_ONE_STEP = 1e-6  # share of the largest displacement by which two states may differ from one step
 
 
 class Trajectory(list[State]):
@@ -58,6 +63,84 @@ class Trajectory(list[State]):
 
     def __repr__(self) -> str:
         return f"Trajectory({len(self)} states)"
+
+    def at(self, times: object) -> Tensor:
+        """Positions between the states: cubic in time, by positions and velocities.
+
+        Velocities of states are means over the step that led to them, with both integrators.
+        Between two states that are one step apart, the velocity at the first is therefore the mean
+        of both; at other states it is the one that they have, which is half a step early. Keep all
+        steps where the step is not short beside the motion.
+
+        >>> dc.Trajectory([start, *states]).at(camera_times - delay)
+
+        Args:
+            times: K times [s] from that of the first state to that of the last one; they may
+                require gradients, as a delay does that is to be found.
+
+        Returns:
+            Positions [m], shape [K, N, 3], or [K, B, N, 3] in a batch whose environments have one
+            time; differentiable in states and times.
+
+        Raises:
+            InvalidInput: If a time is outside, or there are fewer than two states.
+        """
+        owner = "Trajectory.at"
+        known = self._times(owner)
+        asked = float_tensor(f"{owner}: `times`", times)
+        if asked.dim() != 1:
+            raise InvalidInput(f"{owner}: `times` must have shape [K], got {list(asked.shape)}")
+        numbers = numbers_of(asked)
+        # A time may leave the ends by rounding, as that of a camera with the period of the steps.
+        slack = _ROUNDING * max(abs(known[0]), abs(known[-1]))
+        outside = ~((numbers >= known[0] - slack) & (numbers <= known[-1] + slack))
+        if outside.any():
+            k = int(np.flatnonzero(outside)[0])
+            raise InvalidInput(
+                f"{owner}: `times` must be between {known[0]:.6g} and {known[-1]:.6g} s, those of "
+                f"the first and the last state, got {numbers[k]:.6g} at [{k}]"
+            )
+        rows = np.clip(np.searchsorted(known, numbers, side="right") - 1, 0, len(known) - 2)
+        before, after = torch.from_numpy(rows), torch.from_numpy(rows + 1)
+        clock = torch.from_numpy(known)
+        step = (clock[after] - clock[before]).reshape(-1, *[1] * self[0].positions.dim())
+        s = (asked - clock[before]).reshape(step.shape) / step
+        x = self.positions
+        v = self._velocities_in_time(x, clock)
+        # Hermite's cubics, with the velocities in steps.
+        return (
+            (1 + 2 * s) * (1 - s) ** 2 * x[before]
+            + s * (1 - s) ** 2 * step * v[before]
+            + s**2 * (3 - 2 * s) * x[after]
+            + s**2 * (s - 1) * step * v[after]
+        )
+
+    def _velocities_in_time(self, positions: Tensor, clock: Tensor) -> Tensor:
+        """Velocities at the times of the states: means of two steps where both are known."""
+        v = self.velocities
+        x, steps = torch.from_numpy(numbers_of(positions)), torch.from_numpy(numbers_of(v))[1:]
+        moved = x.diff(dim=0)
+        times = clock.diff().reshape(-1, *[1] * (x.dim() - 1))
+        left = (moved - times * steps).abs().amax(dim=tuple(range(1, x.dim())))
+        is_one_step = left <= _ONE_STEP * moved.abs().max()
+        weights = (0.5 * is_one_step).to(v.dtype).reshape(times.shape)
+        return torch.cat([v[:-1] + weights * (v[1:] - v[:-1]), v[-1:]])
+
+    def _times(self, owner: str) -> FloatArray:
+        """Times of the states [s], which must increase."""
+        if len(self) < 2:
+            raise InvalidInput(f"{owner}: it needs two or more states, got {len(self)}")
+        for i, state in enumerate(self):
+            check_state(f"{owner}: the state [{i}]", state)
+            if np.ptp(numbers_of(state.time)) > 0:
+                raise InvalidInput(
+                    f"{owner}: environments must have one time, those of the state [{i}] differ"
+                )
+        known = np.array([float(numbers_of(state.time).reshape(-1)[0]) for state in self])
+        if not (np.diff(known) > 0).all():
+            i = int(np.flatnonzero(~(np.diff(known) > 0))[0]) + 1
+            raise InvalidInput(f"{owner}: times of states must increase, that of [{i}] does not")
+        return known
 
     def detach(self) -> Trajectory:
         """Return a copy whose tensors carry no graph."""
