@@ -7,13 +7,16 @@
 ...     log = trainer.update()
 """
 
+from diffcloth_torch.learn.imitation import imitate
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.plans import Plans, plan
 from diffcloth_torch.learn.rollouts import Policy
 from diffcloth_torch.learn.trainer import Trainer
 from diffcloth_torch.learn.workers import Jobs, Processes, Ranks, RayActors, Workers
 
 __all__ = [
     "Jobs",
+    "Plans",
     "Policy",
     "Processes",
     "Ranks",
@@ -21,4 +24,6 @@ __all__ = [
     "Trainer",
     "TrainerOptions",
     "Workers",
+    "imitate",
+    "plan",
 ]

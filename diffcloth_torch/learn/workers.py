@@ -8,18 +8,25 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from datetime import timedelta
 from typing import Any, Generic, Protocol, TypeVar
 
-from diffcloth_torch.checks import NON_NEGATIVE, Range, check_count, check_number
+from diffcloth_torch.checks import (
+    NON_NEGATIVE,
+    Range,
+    check_count,
+    check_number,
+    refuse_threads,
+)
 from diffcloth_torch.errors import InvalidInput, WorkerError
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE, Pool
 from diffcloth_torch.worker import end_with_parent, portable
 
-__all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers"]
+__all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers", "check_workers", "pickled"]
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -34,6 +41,32 @@ class Workers(Protocol):
     def map(self, function: Callable[[Any], Any], items: Any, /) -> Iterable[Any]:
         """Results of a function for items, in their order."""
         ...
+
+
+def check_workers(name: str, workers: object) -> None:
+    """Require workers of other processes, or None."""
+    refuse_threads(name, workers)
+    if workers is not None and (
+        isinstance(workers, type) or not callable(getattr(workers, "map", None))
+    ):
+        raise TypeError(
+            f"{name} must have `map`, as dc.learn.Processes(2) and executors do, got {workers!r}"
+        )
+
+
+def pickled(name: str, function: Callable[..., Any]) -> bytes:
+    """A function for other processes.
+
+    Raises:
+        InvalidInput: If it cannot be pickled.
+    """
+    try:
+        return pickle.dumps(function)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InvalidInput(
+            f"{name} must, with `workers`, be a function of a module, or such as "
+            f"functools.partial(dc.envs.make, 'FoldCloth'), that can be pickled: {error}"
+        ) from error
 
 
 class _Portable(Generic[A, B]):

@@ -79,7 +79,7 @@ PUBLIC = {
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
     "fabrics": "MEASUREMENTS Measurement material",
-    "learn": "Policy Processes Ranks RayActors Trainer TrainerOptions",
+    "learn": "Plans Policy Processes Ranks RayActors Trainer TrainerOptions imitate plan",
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",
