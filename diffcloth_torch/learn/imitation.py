@@ -32,7 +32,7 @@ Teacher = Callable[[Tensor, ClothVectorEnv], Tensor]
 _OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), deviation=0.05)
 _NOISE = 0.1  # standard deviation of the noise on the actions of a teacher that drives
 _NOISY = 0.5  # share of them that have noise
-_RATE = 1e-3  # of Adam at first; it falls to 0 along a cosine
+_RATE = 3e-3  # of Adam at first; it falls to 0 along a cosine
 _BATCH = 256
 
 
@@ -40,11 +40,11 @@ _BATCH = 256
 def imitate(
     make: MakeEnv,
     teacher: str | Plans | Teacher = "scripted",
-    rounds: int = 5,
-    episodes: int = 8,
+    rounds: int = 6,
+    episodes: int = 24,
     seed: int = 0,
     *,
-    iterations: int = 600,
+    iterations: int = 1000,
     options: TrainerOptions | None = None,
 ) -> Policy:
     """Fit a policy to the actions of a teacher in the states that the policy visits.
@@ -94,7 +94,7 @@ def imitate(
             policy = Policy(env, given)
         each = 4 * (policy.observations + env.task.action_size)
         check_memory("imitate: `rounds`", rounds, episodes * env.task.horizon * each, "a round")
-        lessons: Any = (
+        lessons: Replanning | _Labels = (
             Replanning(make, env, checked, seed, noise)
             if isinstance(checked, Plans)
             else _Labels(env, checked, seed, noise)

@@ -179,7 +179,7 @@ def plan(
     first = cpu.tensor(task.first_action).clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
     noise = cpu.randn(attempts, knots, len(first), generator=draws, dtype=torch.float64)
     begun = first + _NOISE * noise
-    stage = partial(_stage, make, workers)
+    stage = partial(_stage, make, lru_cache(maxsize=8)(partial(_sized, make)), workers)
     if coarse is not None:
         _require_same_actions(make, coarse)
         some = stage(_attempts(seeds, begun, iterations, coarse))
@@ -369,10 +369,14 @@ def _sized(make: MakeEnv, count: int, size: int | None) -> ClothVectorEnv:
     return make(num_envs=count) if size is None else make(num_envs=count, size=size)
 
 
-def _stage(make: MakeEnv, workers: Workers | None, pieces: Sequence[_Piece]) -> Improved:
-    """Results of pieces, one behind the other."""
+def _stage(
+    make: MakeEnv,
+    local: Callable[[int, int | None], ClothVectorEnv],
+    workers: Workers | None,
+    pieces: Sequence[_Piece],
+) -> Improved:
+    """Results of pieces, one behind the other; without workers in the local environments."""
     if workers is None:
-        local = lru_cache(maxsize=8)(partial(_sized, make))
         return Improved.together([_improved(local, piece) for piece in pieces])
     name = pickled("plan: `make`", make)
     return Improved.together(list(workers.map(_improved_remotely, [(name, p) for p in pieces])))
