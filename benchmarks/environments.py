@@ -196,18 +196,18 @@ def _episodes(env: envs.ClothVectorEnv, policy: str) -> tuple[float, int]:
     noise = torch.Generator().manual_seed(0)
     if policy == "replayed":
         one = envs.make(env.task.name, 1, size=env.task.side, autoreset_mode="Disabled")
-        script = _roll_out(one, lambda k: one.scripted_actions(), seed=_SEEDS[1])[2]
+        script = roll_out(one, lambda k: one.scripted_actions(), seed=_SEEDS[1])[2]
     act: dict[str, Callable[[int], torch.Tensor]] = {
         "zero": lambda k: torch.zeros(shape),
         "random": lambda k: 2 * torch.rand(shape, generator=noise) - 1,
         "scripted": lambda k: env.scripted_actions(),
         "replayed": lambda k: script[k].expand(shape),
     }
-    total, success, _ = _roll_out(env, act[policy], seed=_SEEDS[0])
+    total, success, _ = roll_out(env, act[policy], seed=_SEEDS[0])
     return float(total.mean()), int(success.sum())
 
 
-def _roll_out(
+def roll_out(
     env: envs.ClothVectorEnv, act: Callable[[int], torch.Tensor], seed: int
 ) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
     """Returns [B], successes [B] and actions of one episode of each environment."""

@@ -1,386 +1,200 @@
-"""Policies by gradients beside PPO and SAC of Stable-Baselines3: returns against steps and time."""
+"""What each method reaches on each task, at starts that it has not seen.
+
+    python -m benchmarks.learning FoldCloth --method imitate --seed 0
+    python -m benchmarks.learning                     # all tasks and methods, seeds 0, 1 and 2
+    python -m benchmarks.learning --only-show
+
+Each task, method and seed is a line of JSON in the file of results; what the file has is not made
+again. `return` and `success` are means of the episodes, `interval` is Wilson's of the successes at
+95 %, `steps` are the environment steps of learning, `minutes` those of the processor.
+
+`zero`, `random` and `script` learn nothing; `replay` repeats the actions of one scripted episode.
+`imitate` is `dc.learn.imitate` of the script. `plan` is `dc.learn.plan`: its successes are those of
+the starts for which it plans, as no policy comes of it.
+"""
 
 from __future__ import annotations
 
 import json
-import math
-import statistics
+import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 import torch
 
+from benchmarks.environments import roll_out, wilson
 from diffcloth_torch import envs
-from diffcloth_torch.config.documents import read_document
-from diffcloth_torch.learn import Trainer, TrainerOptions
+from diffcloth_torch.learn import imitate, plan
+
+METHODS = ("zero", "random", "script", "replay", "imitate", "plan")
+SOFT = {"opens_at": -1.0, "reach": 0.06}  # grasps with gradients
+SHEETS = ("FoldCloth", "FoldClothDiagonal", "SpreadCloth", "DropCloth", "FlingCloth")
+_FRESH = 10_000  # seed of the starts of evaluations
+_REPLAYED = 20_000  # and of the episode that is replayed
+
+Result = tuple[torch.Tensor, torch.Tensor, int, float]
+"""Returns [n], successes [n], environment steps and seconds of learning."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """A task: its configuration, vertices a side, and environment steps of a run.
-
-    Attributes:
-        free_steps: Of PPO and SAC, which need more.
-    """
-
-    config: str
-    size: int
-    steps: int
-    free_steps: int
-
-
-JOBS = {
-    # An odd size: a row of vertices lies where the fold shall be, or nobody succeeds.
-    "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 10_000),
-    "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
-    "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
-}
-FIRST_ORDER, FREE = ("planned", "apg", "shac", "sapo"), ("ppo", "sac")
-ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
-# Of FoldCloth alone: a plan with hard grasps, APG with gradients through what it sees, and a
-# planned policy with one scale for each tensor.
-VARIANTS = ("hard", "feedback", "scaled")
-# Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
-COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "deviation": 0.05, "target_entropy": -2.0}
-APG: dict[str, Any] = {"discount": 1.0, "actor_rate": 4e-3}
-PLANNED: dict[str, Any] = APG | {"plan_knots": 12, "plan_rate": 0.03, "actor_rate": 6e-4}
-SCALED: dict[str, Any] = PLANNED | {"scale": "tensor", "plan_rate": 0.02, "actor_rate": 3e-4}
-WITH_CRITIC = {"discount": 0.99, "actor_rate": 2e-3}
-NUM_ENVS, FREE_ENVS = 2, 4
-LABELS = {"plan": "plan", "planned": "APG, planned"}
-KNOTS, PLAN_RATE = 10, 0.02  # of a plan: actions that last a tenth of an episode
-EPISODES = 4  # of an evaluation
-
-
-@click.command()
-@click.option("--tasks", multiple=True, default=tuple(JOBS), type=click.Choice(list(JOBS)))
+@click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
+@click.argument("tasks", nargs=-1, type=click.Choice(list(envs.TASKS)))
+@click.option("--method", "methods", multiple=True, default=METHODS, type=click.Choice(METHODS))
+@click.option("--seed", "seeds", multiple=True, default=(0, 1, 2), type=click.IntRange(0))
+@click.option("--size", default=7, show_default=True, type=click.IntRange(4))
+@click.option("--episodes", default=64, show_default=True, type=click.IntRange(1))
+@click.option("--rounds", type=click.IntRange(1), help="Of `imitate`.")
+@click.option("--starts", type=click.IntRange(1), help="Episodes of a round, or plans.")
 @click.option(
-    "--algorithms",
-    multiple=True,
-    default=(*ALGORITHMS, *VARIANTS),
-    type=click.Choice((*ALGORITHMS, *VARIANTS)),
+    "--results",
+    default="results/learning.jsonl",
+    show_default=True,
+    type=click.Path(dir_okay=False, path_type=Path),
 )
-@click.option("--seeds", default=3, show_default=True, type=click.IntRange(1))
-@click.option("--share", default=1.0, show_default=True, help="Of the steps of all runs.")
-@click.option("--evaluations", default=6, show_default=True, type=click.IntRange(2))
-@click.option("--jobs", default=2, show_default=True, help="Runs at once, one core each.")
-@click.option("--json", "file", type=click.Path(path_type=Path), help="File that keeps the runs.")
-@click.option("--plot", type=click.Path(path_type=Path), help="Also draw them.")
 @click.option("--only-show", is_flag=True, help="Run nothing: show what the file has.")
 def main(
     tasks: Sequence[str],
-    algorithms: Sequence[str],
-    seeds: int,
-    share: float,
-    evaluations: int,
-    jobs: int,
-    file: Path | None,
-    plot: Path | None,
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    size: int,
+    episodes: int,
+    rounds: int | None,
+    starts: int | None,
+    results: Path,
     only_show: bool,
 ) -> None:
-    """Train with each algorithm and seed, and evaluate without noise on the way.
-
-    `plan` is no policy: it optimizes the actions of one episode, whose return it is. `planned` is
-    APG whose policy is a plan, a linear function of what it sees, and a network; `apg` has the
-    network alone. `scripted` is the policy made by hand. FoldCloth has three more: `hard`, a plan
-    with hard grasps, `feedback`, APG with gradients through what it sees, and `scaled`, `planned`
-    with the scale "tensor". A file keeps what was run, and a run that it has is not made again.
-
-    Prints the median over seeds of the best mean return, how many environment steps and seconds
-    of one core each needed to reach the best that PPO reached, and the share of successes at the
-    end. The time of evaluations does not count.
-    """
-    runs: list[dict[str, Any]] = []
-    if file is not None and file.exists():
-        runs = json.loads(file.read_text())
-    have = {(r["task"], r["algorithm"], r["seed"]) for r in runs}
-    work = [
-        (task, algorithm, seed, share, evaluations)
-        for seed in range(seeds)
-        for task in tasks
-        for algorithm in algorithms
-        if (task, algorithm, seed) not in have and not only_show
-        if task == "FoldCloth" or algorithm not in VARIANTS
-    ]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for work_of_one in as_completed([pool.submit(_run, one) for one in work]):
-            runs.append(work_of_one.result())
-            if file is not None:
-                file.write_text(_document(runs))
-    for task in tasks:
-        _print(task, [run for run in runs if run["task"] == task])
-    if plot is not None:
-        draw(runs, plot)
-
-
-def _document(runs: Sequence[dict[str, Any]]) -> str:
-    """One run a line, in a fixed order."""
-    order = (*ALGORITHMS, *VARIANTS)
-    rows = sorted(runs, key=lambda r: (r["task"], order.index(r["algorithm"]), r["seed"]))
-    return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
-
-
-def _print(task: str, runs: Sequence[dict[str, Any]]) -> None:
-    goals = [max(p["return"] for p in run["curve"]) for run in runs if run["algorithm"] == "ppo"]
-    goal = statistics.median(goals) if goals else math.nan
-    print(f"{task}: goal {goal:.2f}, the median of PPO's best")
-    print(
-        "algorithm  seeds   first     best      last  success  steps to goal  seconds to it  steps"
-    )
-    for algorithm in (*ALGORITHMS, *VARIANTS):
-        mine = [run for run in runs if run["algorithm"] == algorithm]
-        if not mine:
-            continue
-        columns = [
-            statistics.median(values)
-            for values in zip(*[_summary(run["curve"], goal) for run in mine], strict=True)
-        ]
-        first, best, last, success, at, after, steps = columns
-        print(
-            f"{algorithm:9}{len(mine):6d}{first:8.2f}{best:8.2f}{last:8.2f} {success:7.0%} "
-            f"{at:14.0f} {after:14.1f} {steps:6.0f}"
-        )
-
-
-def _summary(curve: Sequence[dict[str, float]], goal: float) -> list[float]:
-    reached = [point for point in curve if point["return"] >= goal]
-    at, after = (reached[0]["steps"], reached[0]["seconds"]) if reached else (math.inf, math.inf)
-    best = max(point["return"] for point in curve)
-    end = curve[-1]
-    return [curve[0]["return"], best, end["return"], end["success"], at, after, end["steps"]]
-
-
-def _run(work: tuple[str, str, int, float, int]) -> dict[str, Any]:
     torch.set_num_threads(1)
-    task, algorithm, seed, share, evaluations = work
-    job = JOBS[task]
-    document = read_document(Path(job.config))
-    given = document["environment"].get("options", {}) | {"size": job.size}
-    make = partial(envs.make, task, **given)
-    first = document["trainer"].get("first_action")
-    steps = round(share * (job.free_steps if algorithm in FREE else job.steps))
-    # More of them at first, where much changes; none after the last.
-    due = [steps * (k / (evaluations - 1)) ** 2 for k in range(evaluations)] + [math.inf]
-    if algorithm == "scripted":
-        curve = _scripted(make)
-    elif algorithm == "plan":
-        curve = _plan(make, first, seed, steps)
-    elif algorithm == "hard":
-        hard = {n: v for n, v in given.items() if n not in ("opens_at", "reach")}
-        curve = _plan(partial(envs.make, task, **hard), first, seed, steps)
-    elif algorithm in FREE:
-        curve = _free(make, algorithm, seed, steps, due, first)
-    else:
-        curve = _first_order(make, algorithm, seed, steps, due, first)
-    return {"task": task, "algorithm": algorithm, "seed": seed, "curve": curve}
+    rows = read(results)
+    have = {key_of(row) for row in rows}
+    given = {"rounds": rounds, "episodes": starts}
+    changed = {name: value for name, value in given.items() if value is not None}
+    for task in tasks or tuple(envs.TASKS):
+        for method in methods:
+            for seed in seeds:
+                if only_show or (task, size, method, seed) in have:
+                    continue
+                row = measured(task, size, method, seed, episodes, changed)
+                results.parent.mkdir(parents=True, exist_ok=True)
+                with results.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                rows.append(row)
+    show(rows)
 
 
-def _point(steps: int, seconds: float, value: float, success: float) -> dict[str, float]:
+def key_of(row: dict[str, Any]) -> tuple[str, int, str, int]:
+    """What is not made again."""
+    return row["task"], row["size"], row["method"], row["seed"]
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Rows of a file of results; the end of a line that was cut off is left out."""
+    if not path.exists():
+        return []
+    text = path.read_text()
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        path.write_text(whole)
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def show(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the rows as a table."""
+    print("| task | size | method | seed | return | success | steps | minutes |")
+    print("|---" * 8 + "|")
+    for row in sorted(rows, key=lambda r: (r["task"], METHODS.index(r["method"]), r["seed"])):
+        low, high = row["interval"]
+        share = f"{row['success']:.0%} ({low:.0%} to {high:.0%})".replace("%", " %")
+        print(
+            f"| `{row['task']}` | {row['size']} | {row['method']} | {row['seed']} | "
+            f"{row['return']:.1f} | {share} of {row['episodes']} | {row['steps']} | "
+            f"{row['minutes']:.1f} |"
+        )
+    sys.stdout.flush()
+
+
+def measured(
+    task: str, size: int, method: str, seed: int, episodes: int, changed: dict[str, int]
+) -> dict[str, Any]:
+    """The row of a task, a method and a seed."""
+    make = partial(envs.make, task, size=size)
+    run = {"imitate": _imitate, "plan": _plan}.get(method, partial(_unlearned, method))
+    returns, success, steps, seconds = run(make, seed, episodes, changed)
+    count, done = len(success), int(success.sum())
     return {
+        "task": task,
+        "size": size,
+        "method": method,
+        "seed": seed,
+        "episodes": count,
+        "return": round(float(returns.mean()), 4),
+        "success": done / count,
+        "interval": [round(bound, 4) for bound in wilson(done, count)],
         "steps": steps,
-        "seconds": round(seconds, 2),
-        "return": round(value, 4),
-        "success": success,
+        "minutes": round(seconds / 60, 3),
+        "given": changed,
     }
 
 
-def _scripted(make: Callable[..., Any]) -> list[dict[str, float]]:
-    curve = _Curve(make, None)
-    curve.add(0)
-    return curve.points
-
-
-def _first_order(
-    make: Callable[..., Any],
-    algorithm: str,
-    seed: int,
-    steps: int,
-    due: Sequence[float],
-    first: Sequence[float] | None,
-) -> list[dict[str, float]]:
-    """A policy by gradients, of which the learning rate falls to half."""
-    episode = make(num_envs=1).task.horizon
-    has_critic = algorithm in ("shac", "sapo")
-    horizon = episode // 2 if has_critic else episode
-    of_apg = {"planned": PLANNED, "scaled": SCALED}.get(algorithm, APG)
-    options = TrainerOptions(
-        algorithm=algorithm if has_critic else "apg",
-        feedback=algorithm == "feedback",
-        horizon=horizon,
-        decay_updates=2 * steps // (NUM_ENVS * horizon),
-        first_action=None if first is None else tuple(first),
-        seed=seed,
-        **COMMON,
-        **(WITH_CRITIC if has_critic else of_apg),
-    )
-    trainer = Trainer(make, options, num_envs=NUM_ENVS)
-    curve = _Curve(make, trainer.act)
-    curve.add(0)
-    while trainer.steps < steps:
-        trainer.update()
-        if trainer.steps >= due[len(curve.points)]:
-            curve.add(trainer.steps)
-    return curve.points
-
-
-def _plan(
-    make: Callable[..., Any], first: Sequence[float] | None, seed: int, steps: int
-) -> list[dict[str, float]]:
-    """The actions of one episode, by Adam."""
-    env = make(num_envs=1)
-    horizon = env.task.horizon
-    start = torch.zeros(env.task.action_size) if first is None else torch.tensor(first)
-    plan = start.repeat(KNOTS, 1).requires_grad_()
-    adam = torch.optim.Adam([plan], lr=PLAN_RATE)
-    points: list[dict[str, float]] = []
-    begin = time.process_time()
-    while not points or points[-1]["steps"] < steps:
-        env.reset(seed=1000 + seed)
-        total = torch.zeros(())
-        for k in range(horizon):
-            _, reward, _, _, info = env.step(plan[None, k * KNOTS // horizon])
-            total = total + reward.sum()
-        success = float(info["final_info"]["success"])
-        at = horizon * (len(points) + 1)
-        points.append(_point(at, time.process_time() - begin, float(total.detach()), success))
-        adam.zero_grad()
-        (-total).backward()
-        adam.step()
-        with torch.no_grad():
-            plan.clamp_(-1, 1)
-    return points
-
-
-class _Curve:
-    """Returns of evaluations; their own time does not count."""
-
-    def __init__(self, make: Callable[..., Any], act: Callable[[torch.Tensor], Any] | None) -> None:
-        """Evaluate a policy, or the one that was made by hand."""
-        self.points: list[dict[str, float]] = []
-        self._env, self._act = make(num_envs=EPISODES), act
-        self._start = time.process_time()
-
-    def add(self, steps: int) -> None:
-        begin = time.process_time()
-        env = self._env
-        observation, _ = env.reset(seed=1000)
-        total = torch.zeros(EPISODES)
-        running = torch.ones(EPISODES, dtype=torch.bool)
-        success = torch.zeros(EPISODES, dtype=torch.bool)
-        with torch.no_grad():
-            while bool(running.any()):
-                scripted = env.scripted_actions() if self._act is None else None
-                actions = scripted if self._act is None else self._act(observation)
-                observation, reward, terminated, truncated, info = env.step(actions)
-                total += torch.where(running, reward, 0.0)
-                success = torch.where(running, info.get("final_info", info)["success"], success)
-                running = running & ~(terminated | truncated)
-        seconds = begin - self._start
-        self.points.append(
-            _point(steps, seconds, float(total.mean()), float(success.float().mean()))
+def _imitate(make: Callable[..., Any], seed: int, episodes: int, changed: dict[str, int]) -> Result:
+    with _counted() as learned:
+        policy = imitate(make, "scripted", seed=seed, **changed)
+    env = make(num_envs=episodes, autoreset_mode="Disabled")
+    with torch.no_grad():
+        returns, success, _ = roll_out(
+            env, lambda _: policy(env.initialize_trajectory()), _FRESH + seed
         )
-        self._start += time.process_time() - begin
+    return returns, success, *learned
 
 
-def _free(
-    make: Callable[..., Any],
-    algorithm: str,
-    seed: int,
-    steps: int,
-    due: Sequence[float],
-    first: Sequence[float] | None,
-) -> list[dict[str, float]]:
-    """PPO or SAC from the same first action.
-
-    Their options are the usual ones, but that PPO learns every 256 steps, with less noise at first:
-    with 2048 and a deviation of 1 it learns nothing in so few steps.
-    """
-    from stable_baselines3 import PPO, SAC
-    from stable_baselines3.common.callbacks import BaseCallback
-
-    from diffcloth_torch.envs.stable_baselines import StableBaselinesEnv
-
-    class Begun(StableBaselinesEnv):
-        def step_async(self, actions: Any) -> None:
-            super().step_async(begun(actions))
-
-    def begun(actions: Any) -> Any:
-        return actions if first is None else np.clip(actions + np.float32(first), -1, 1)
-
-    env = Begun(make(num_envs=FREE_ENVS, seed=seed))
-    if algorithm == "ppo":
-        model: Any = PPO(
-            "MlpPolicy",
-            env,
-            n_steps=64,
-            policy_kwargs={"log_std_init": -1.0},
-            seed=seed,
-            device="cpu",
-        )
-    else:
-        model = SAC(
-            "MlpPolicy", env, learning_starts=400, gradient_steps=-1, seed=seed, device="cpu"
-        )
-    curve = _Curve(make, lambda seen: begun(model.predict(seen.numpy(), deterministic=True)[0]))
-    curve.add(0)
-
-    class Evaluate(BaseCallback):  # type: ignore[misc]
-        def _on_step(self) -> bool:
-            if self.num_timesteps >= due[len(curve.points)]:
-                curve.add(self.num_timesteps)
-            return True
-
-    model.learn(steps, callback=Evaluate())
-    return curve.points
+def _plan(make: Callable[..., Any], seed: int, _: int, changed: dict[str, int]) -> Result:
+    soft = SOFT if make(num_envs=1).task.name in SHEETS else {}
+    given = {name: value for name, value in changed.items() if name != "rounds"}
+    with _counted() as learned:
+        plans = plan(partial(make, **soft), seed=seed, **given)
+    return plans.returns, plans.success, *learned
 
 
-def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
-    """Returns against environment steps and against time: medians, and the range of the seeds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "learning"})
-    import matplotlib.pyplot as plt
-
-    tasks = [task for task in JOBS if any(run["task"] == task for run in runs)]
-    figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 3.0 * len(tasks)), squeeze=False)
-    for row, task in zip(axes, tasks, strict=True):
-        for axis, key in zip(row, ("steps", "seconds"), strict=True):
-            _draw_task(axis, key, [run for run in runs if run["task"] == task])
-            label = "environment steps" if key == "steps" else "seconds of one core"
-            axis.set(xlabel=label, ylabel="return", title=task)
-            axis.set_xscale("symlog", linthresh=100 if key == "steps" else 1)
-            axis.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].legend(frameon=False, fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+def _unlearned(
+    method: str, make: Callable[..., Any], seed: int, episodes: int, _: dict[str, int]
+) -> Result:
+    env = make(num_envs=episodes, autoreset_mode="Disabled")
+    shape = episodes, env.task.action_size
+    noise = torch.Generator().manual_seed(seed)
+    script: list[torch.Tensor] = []
+    if method == "replay":
+        one = make(num_envs=1, autoreset_mode="Disabled")
+        script = roll_out(one, lambda _: one.scripted_actions(), _REPLAYED + seed)[2]
+    act: dict[str, Callable[[int], torch.Tensor]] = {
+        "zero": lambda _: torch.zeros(shape),
+        "random": lambda _: 2 * torch.rand(shape, generator=noise) - 1,
+        "script": lambda _: env.scripted_actions(),
+        "replay": lambda k: script[k].expand(shape),
+    }
+    returns, success, _made = roll_out(env, act[method], _FRESH + seed)
+    return returns, success, 0, 0.0
 
 
-def _draw_task(axis: Any, key: str, runs: Sequence[dict[str, Any]]) -> None:
-    for k, algorithm in enumerate(ALGORITHMS):
-        curves = [r["curve"] for r in runs if r["algorithm"] == algorithm]
-        if not curves:
-            continue
-        if algorithm == "scripted":
-            axis.axhline(curves[0][0]["return"], color="0.5", ls=":", label="scripted")
-            continue
-        end = min(curve[-1][key] for curve in curves)
-        at = np.linspace(0, end, 40)
-        returns = np.array(
-            [np.interp(at, [p[key] for p in c], [p["return"] for p in c]) for c in curves]
-        )
-        label = LABELS.get(algorithm, algorithm.upper())
-        axis.plot(at, np.median(returns, axis=0), color=f"C{k}", label=label)
-        axis.fill_between(at, returns.min(0), returns.max(0), color=f"C{k}", alpha=0.15)
+@contextmanager
+def _counted() -> Iterator[list[Any]]:
+    """Environment steps and processor seconds of a block; known after it."""
+    counts: list[Any] = []
+    transition, steps, begin = envs.Task.transition, 0, time.process_time()
+
+    def counting(task: envs.Task, env: envs.EnvState, *given: Any) -> envs.EnvState:
+        nonlocal steps
+        steps += len(env)
+        return transition(task, env, *given)
+
+    envs.Task.transition = counting  # type: ignore[method-assign]
+    try:
+        yield counts
+    finally:
+        envs.Task.transition = transition  # type: ignore[method-assign]
+        counts += [steps, time.process_time() - begin]
 
 
 if __name__ == "__main__":

@@ -217,6 +217,21 @@ class World:
         return dc.learn.Trainer(self.make_env, options, num_envs=2)
 
     @cached_property
+    def plans(self):
+        return dc.learn.Plans(
+            actions=torch.full((2, 3, 8), 0.1, dtype=F64, device="cpu"),
+            returns=torch.ones(2, dtype=F64, device="cpu"),
+            success=torch.ones(2, dtype=torch.bool, device="cpu"),
+            seeds=torch.arange(2, dtype=torch.int64, device="cpu"),
+        )
+
+    @cached_property
+    def saved_plans(self):
+        path = self.folder / "saved_plans.pt"
+        self.plans.save(path)
+        return path
+
+    @cached_property
     def observation(self):
         return self.env._observe(self.env.env_state)
 
@@ -525,6 +540,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     ),
     "learn.Jobs": lambda w: call(dc.learn.Jobs, Inline()),
     "learn.Jobs.map": lambda w: call(dc.learn.Jobs(Inline()).map, float, ["1", "2"]),
+    "learn.Plans": lambda w: call(dc.learn.Plans, **vars(w.plans)),
+    "learn.Plans.load": lambda w: call(dc.learn.Plans.load, w.saved_plans),
+    "learn.Plans.save": lambda w: call(w.plans.save, w.folder / "plans.pt"),
     "learn.Policy": lambda w: call(seeded, dc.learn.Policy, w.env, dc.learn.TrainerOptions()),
     "learn.Policy.act": lambda w: call(
         w.kept[0].policy.act, w.observation, torch.full_like(w.env.scripted_actions(), 0.1)
@@ -545,6 +563,10 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "learn.TrainerOptions.rate_share": lambda w: call(dc.learn.TrainerOptions().rate_share, 3),
     "learn.evaluate": lambda w: call(dc.learn.evaluate, w.make_env, "scripted", 2, 1),
     "learn.load_policy": lambda w: call(dc.learn.load_policy, w.kept[1]),
+    "learn.imitate": lambda w: call(
+        dc.learn.imitate, w.make_env, "scripted", 1, 2, 1, iterations=2
+    ),
+    "learn.plan": lambda w: call(dc.learn.plan, w.make_env, 2, 1, 2, 1, 3),
     "robots.panda": lambda w: call(dc.robots.panda),
     "residuals.extrapolated": lambda w: call(
         residuals.extrapolated, w.residual, w.residual, ratio=2.0

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 
 import diffcloth_torch as dc
 
@@ -468,3 +469,37 @@ def test_energy_of_fast_turns_is_counted():
         assert int(steps) == round(50 / float(dt))
         assert float(formula) == pytest.approx(9.81 * (float(dt) / 1e3) ** 2 / 0.07, abs=1e-4)
         assert -1 < float(largest) < 2 * float(formula) + 1e-3
+
+
+def test_rows_of_learning_are_made_once(tmp_path):
+    learning = importlib.import_module("benchmarks.learning")
+    file = tmp_path / "rows.jsonl"
+    common = ["HitCloth", "--size", "4", "--episodes", "2", "--results", str(file)]
+
+    def run(*arguments):
+        result = CliRunner().invoke(learning.main, [*common, *arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return [json.loads(line) for line in file.read_text().splitlines()]
+
+    first = run("--method", "zero", "--seed", "0")
+    assert [(row["task"], row["method"], row["seed"]) for row in first] == [("HitCloth", "zero", 0)]
+    assert first[0]["episodes"] == 2
+    assert first[0]["success"] == 0.0
+    assert first[0]["interval"][1] == pytest.approx(0.6576, abs=1e-4)  # Wilson's, of 0 of 2
+    assert first[0]["steps"] == 0
+    with file.open("a") as end:
+        end.write('{"task": "HitCl')  # cut off
+    second = run("--method", "zero", "--method", "script", "--seed", "0")
+    assert second[0] == first[0]
+    assert [row["method"] for row in second] == ["zero", "script"]
+    assert second[1]["return"] > first[0]["return"]
+
+
+@pytest.mark.slow
+def test_learning_counts_its_steps(tmp_path):
+    learning = importlib.import_module("benchmarks.learning")
+    row = learning.measured("HitCloth", 4, "imitate", 0, 2, {"rounds": 2, "episodes": 2})
+    assert row["steps"] == 2 * 2 * 36
+    assert row["minutes"] > 0
+    row = learning.measured("HitCloth", 4, "plan", 0, 2, {"episodes": 1})
+    assert row["episodes"] == 1

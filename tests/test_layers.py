@@ -149,6 +149,7 @@ UNPICKLERS = {
     "benchmarks/branches.py": {"torch.load"},
     "benchmarks/scenes.py": {"torch.load"},
     # Read messages between a process and its own workers.
+    "diffcloth_torch/learn/plans.py": {"pickle.loads"},
     "diffcloth_torch/learn/rollouts.py": {"pickle.loads"},
     "diffcloth_torch/processes.py": {"pickle.loads"},
     "diffcloth_torch/worker.py": {"pickle.loads"},

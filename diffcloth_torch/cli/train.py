@@ -29,15 +29,10 @@ from diffcloth_torch.config.documents import read_document, set_values
 from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.learn.evaluation import (
-    PURPOSES,
-    episode_seeds,
-    evaluate,
-    follow,
-    purpose_seed,
-)
+from diffcloth_torch.learn.evaluation import evaluate, follow
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.policy import Policy
+from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
 from diffcloth_torch.learn.trainer import Trainer, record_of, restore
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene

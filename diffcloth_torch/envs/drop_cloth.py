@@ -52,6 +52,11 @@ class DropCloth(SheetTask):
         drawn["goal"] = drawn["flat"][:, self._corners]
         return super().started(state, drawn)
 
+    @property
+    def first_action(self) -> tuple[float, ...]:
+        """Pickers hold the corners."""
+        return (0.0, 0.0, 0.0, 0.95) * self.pickers.count
+
     def tools(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tools:
         """Pickers that hold the upper corners."""
         return self.pickers.start(at(positions, drawn["picked"]), drawn["picked"])

@@ -295,6 +295,15 @@ class Task(ABC):
         return self.actuator.size
 
     @property
+    def first_action(self) -> tuple[float, ...]:
+        """Action from which plans and policies begin to learn, between -1 and 1, [A].
+
+        It should move something that counts: where nothing is touched, rewards have no gradient. It
+        is zero unless a task has another one.
+        """
+        return (0.0,) * self.action_size
+
+    @property
     def observation_slices(self) -> dict[str, slice]:
         """Name of a feature -> its place in an observation."""
         sizes = {n: f.shape[-1] for n, f in self.features(self.example()).items()}

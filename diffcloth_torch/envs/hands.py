@@ -60,6 +60,12 @@ class HandTask(BuiltTask):
         cloths = [with_material(cloth, material) for cloth in scene.cloths]
         return Scene(cloths, [*scene.bodies, *self.obstacles], scene.robots), self.hand
 
+    @property
+    def first_action(self) -> tuple[float, ...]:
+        """Fingers close with an effort that holds the cloth, and the hand rises slowly."""
+        rise = (0.0, 0.1, 0.0) if self.frame == "task" else (0.0, 0.0, 0.1)  # y of the base is up
+        return (*rise, 0.0, 0.0, 0.0, 0.95)
+
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Where the gripper is, within 4 mm."""
         return {"shift": uniform(generator, 3, -0.004, 0.004)}

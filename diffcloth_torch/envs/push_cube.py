@@ -60,6 +60,12 @@ class PushCube(BuiltTask):
         self._rows = some if self.sees == "keypoints" else cpu.arange(count)
         return Scene([sheet], scene.bodies), Velocities(pins, dt=DT, speed=_SPEED)
 
+    @property
+    def first_action(self) -> tuple[float, ...]:
+        """The sheet moves towards the cube."""
+        along = (0.35, 0.0, 0.0) if self.frame == "task" else (0.0, 0.35, 0.0)
+        return along * (self.action_size // 3)
+
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Where the cube stands, within 2 cm, and its target, within 5 cm."""
         return {

@@ -88,6 +88,11 @@ class SheetTask(BuiltTask):
         """See `BuiltTask`."""
         return ContactOptions(barrier_distance=HEIGHT)
 
+    @property
+    def first_action(self) -> tuple[float, ...]:
+        """Pickers close and rise: a sheet that is pulled flat along the table gains nothing."""
+        return (0.0, 0.0, 0.2, 0.95) * self.pickers.count
+
     def vertex(self, row: int, column: int) -> int:
         """Index of a vertex; negative rows and columns count from the end."""
         return (row % self.side) * self.side + column % self.side

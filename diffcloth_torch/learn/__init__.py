@@ -9,7 +9,9 @@
 
 from diffcloth_torch.learn.demonstrations import record
 from diffcloth_torch.learn.evaluation import Episodes, evaluate
+from diffcloth_torch.learn.imitation import imitate
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.plans import Plans, plan
 from diffcloth_torch.learn.policy import Policy, PolicySizes, load_policy
 from diffcloth_torch.learn.trainer import Trainer
 from diffcloth_torch.learn.workers import Jobs, Processes, Ranks, RayActors, Workers
@@ -17,6 +19,7 @@ from diffcloth_torch.learn.workers import Jobs, Processes, Ranks, RayActors, Wor
 __all__ = [
     "Episodes",
     "Jobs",
+    "Plans",
     "Policy",
     "PolicySizes",
     "Processes",
@@ -26,6 +29,8 @@ __all__ = [
     "TrainerOptions",
     "Workers",
     "evaluate",
+    "imitate",
     "load_policy",
+    "plan",
     "record",
 ]

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,31 +21,26 @@ from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn.policy import Policy, PolicySizes, check_fits
 from diffcloth_torch.learn.rollouts import MakeEnv, environments, threads_of_torch
+from diffcloth_torch.learn.starts import episode_seeds
 from diffcloth_torch.learn.workers import Workers, check_workers, pickled
 from diffcloth_torch.operations import called
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.sim.records.state import State
 
 __all__ = [
-    "PURPOSES",
     "Acts",
     "Episodes",
     "Step",
     "acting",
-    "episode_seeds",
     "evaluate",
     "evaluate_starts",
     "follow",
-    "purpose_seed",
     "seeds_of",
     "steps_of",
 ]
 
 Acts = Callable[[Tensor], Any] | str
 """A function of observations [B, O] that returns actions [B, A], or "scripted"."""
-
-PURPOSES = ("undo", "selection", "report")
-"""Uses of starts in a training, which have no start in common."""
 
 _LARGEST_EPISODES = 10**6  # more than of a day
 _CHUNK = 8  # environments that step together
@@ -154,19 +148,6 @@ def seeds_of(owner: str, seed: int, episodes: int) -> list[int]:
     check_count(f"{owner}: `episodes`", episodes, 1, _LARGEST_EPISODES)
     check_count(f"{owner}: `seed`", seed, 0, _LARGEST_SEED)
     return episode_seeds(seed, episodes)
-
-
-def episode_seeds(seed: int, episodes: int) -> list[int]:
-    """A seed for each episode, of which the first ones do not depend on the number."""
-    sequences = [np.random.SeedSequence(seed, spawn_key=(i,)) for i in range(episodes)]
-    return [int(s.generate_state(1, np.uint64)[0]) for s in sequences]
-
-
-def purpose_seed(seed: int, purpose: str) -> int:
-    """The seed of the starts of one of `PURPOSES`, by the seed of a training."""
-    # Seeds of `Trainer` for its own starts have no spawn key.
-    sequence = np.random.SeedSequence(seed, spawn_key=(PURPOSES.index(purpose),))
-    return int(sequence.generate_state(1, np.uint64)[0])
 
 
 def evaluate_starts(

@@ -36,12 +36,7 @@ from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.adam import TensorAdam
-from diffcloth_torch.learn.evaluation import (
-    episode_seeds,
-    evaluate_starts,
-    follow,
-    purpose_seed,
-)
+from diffcloth_torch.learn.evaluation import evaluate_starts, follow
 from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.policy import TRAINER, Policy, begin_at, file_to_write
@@ -53,6 +48,7 @@ from diffcloth_torch.learn.rollouts import (
     roll_out_remotely,
     threads_of_torch,
 )
+from diffcloth_torch.learn.starts import episode_seeds, purpose_seed
 from diffcloth_torch.learn.workers import Ranks, Workers, check_workers, pickled
 from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State

@@ -14,7 +14,7 @@ from diffcloth_torch.envs import env as env_module
 from diffcloth_torch.envs.fold_cloth import FoldCloth
 from diffcloth_torch.learn import Episodes, Policy, Processes, TrainerOptions, evaluate
 from diffcloth_torch.learn import evaluation as module
-from diffcloth_torch.learn.evaluation import PURPOSES, episode_seeds, purpose_seed
+from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
 from diffcloth_torch.learn.trainer import Trainer
 
 ROWS = ("returns", "success", "ever", "failed", "blocked")

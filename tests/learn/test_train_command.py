@@ -14,7 +14,7 @@ from diffcloth_torch import envs
 from diffcloth_torch.cli import main
 from diffcloth_torch.cli import train as train_module
 from diffcloth_torch.learn import Trainer, evaluate, load_policy
-from diffcloth_torch.learn.evaluation import episode_seeds, purpose_seed
+from diffcloth_torch.learn.starts import episode_seeds, purpose_seed
 
 SHORT = """
 task: train

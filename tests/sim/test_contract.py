@@ -87,8 +87,8 @@ PUBLIC = {
     "envs": "make TASKS ClothVectorEnv Task",
     "fabrics": "MEASUREMENTS Measurement material",
     "learn": (
-        "Episodes Policy PolicySizes Processes Ranks RayActors Trainer TrainerOptions evaluate "
-        "load_policy record"
+        "Episodes Plans Policy PolicySizes Processes Ranks RayActors Trainer TrainerOptions "
+        "evaluate imitate load_policy plan record"
     ),
     "robots": "GRIPPER panda",
     "stack": "",

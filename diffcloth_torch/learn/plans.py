@@ -1,0 +1,425 @@
+"""Plans: actions of whole episodes, by gradients, one for each of several starts.
+
+A plan is the tanh of hat functions of the time. Starts do not depend on each other: a piece of work
+is the plans of some starts, and its results have the same bits wherever it is computed.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch import cpu
+from diffcloth_torch.checkpoint import (
+    check_like,
+    read_checkpoint,
+    refusing_damage,
+    write_checkpoint,
+)
+from diffcloth_torch.checks import check_count
+from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.files import as_path
+from diffcloth_torch.learn.rollouts import MakeEnv, threads_of_torch
+from diffcloth_torch.learn.starts import LARGEST_SEED, part_seeds
+from diffcloth_torch.learn.workers import Workers, check_workers, pickled
+from diffcloth_torch.memory import check_memory
+from diffcloth_torch.operations import called
+
+__all__ = ["Improved", "Plans", "improve", "knots_of", "plan"]
+
+_CHECKPOINT = "plans"  # kind of its files
+_TOGETHER = 2  # starts of a piece
+_BETAS = (0.9, 0.95)  # of Adam
+_RATE, _LAST_SHARE = 0.1, 0.1  # its learning rate at first, and the share of it at last
+_NOISE = 0.2  # standard deviation of the first noise of knots
+_LARGEST_KNOT = 0.995  # first actions are clipped to this before atanh
+_SHARE = 3  # plans that begin from good ones take the iterations over this
+_LARGEST_COUNT = 10**6
+
+
+@dataclass(frozen=True, eq=False)
+class Plans:
+    """Plans for E starts of a task.
+
+    Attributes:
+        actions: Of all T transitions of an episode, in the frame of the task, float64 [E, T, A].
+        returns: Sums of their rewards, float64 [E].
+        success: Whether they succeed [E].
+        seeds: Of the starts: `env.reset(seed=plans.seeds.tolist())` begins there; int64 [E].
+    """
+
+    actions: Tensor
+    returns: Tensor
+    success: Tensor
+    seeds: Tensor
+
+    def __post_init__(self) -> None:
+        kinds = (torch.float64, torch.float64, torch.bool, torch.int64)
+        for field, kind in zip(fields(self), kinds, strict=True):
+            value = getattr(self, field.name)
+            axes = "[E, T, A]" if field.name == "actions" else "[E]"
+            if not isinstance(value, Tensor):
+                raise TypeError(
+                    f"Plans: `{field.name}` must be a tensor {axes}, got {type(value).__name__}"
+                )
+            rank = 3 if field.name == "actions" else 1
+            if value.dtype != kind or value.dim() != rank or not value.is_cpu:
+                raise InvalidInput(
+                    f"Plans: `{field.name}` must be a tensor {axes} of {kind} on the CPU, got "
+                    f"{value.dtype} {list(value.shape)} on {value.device}"
+                )
+            if not len(value) or len(value) != len(self.actions):
+                raise InvalidInput(
+                    f"Plans: `{field.name}` must be of {max(len(self.actions), 1)} starts, got "
+                    f"{len(value)}"
+                )
+        if not bool((self.actions.abs() <= 1).all()):
+            raise InvalidInput("Plans: `actions` must be between -1 and 1")
+        if not bool(torch.isfinite(self.returns).all()):
+            raise InvalidInput("Plans: `returns` must be finite")
+        if not bool(((self.seeds >= 0) & (self.seeds <= LARGEST_SEED)).all()):
+            raise InvalidInput(f"Plans: `seeds` must be between 0 and {LARGEST_SEED}")
+
+    def __len__(self) -> int:
+        """E, the number of starts."""
+        return len(self.actions)
+
+    def save(self, path: str | Path) -> None:
+        """Write them to a file, which replaces an older one completely or not at all.
+
+        Raises:
+            InvalidInput: If its folder does not exist.
+            OSError: If it cannot be written; an older file stays as it is.
+        """
+        path = as_path("Plans.save: `path`", path)
+        if not path.parent.is_dir():
+            raise InvalidInput(f"Plans.save: the folder of `path` must exist, got {str(path)!r}")
+        content = {field.name: getattr(self, field.name).clone() for field in fields(self)}
+        write_checkpoint(path, _CHECKPOINT, content)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Plans:
+        """Read a file of `save`.
+
+        Raises:
+            InvalidInput: If it is no such file, or is damaged.
+        """
+        path = as_path("Plans.load: `path`", path)
+        if not path.is_file():
+            raise InvalidInput(f"Plans.load: `path` must be a file, got {str(path)!r}")
+        kept = read_checkpoint("Plans.load", path, _CHECKPOINT)
+        with refusing_damage("Plans.load", path):
+            check_like("the content", dict.fromkeys(kept, ""), {f.name: "" for f in fields(cls)})
+            return cls(**kept)
+
+
+@called("plan")
+def plan(
+    make: MakeEnv,
+    episodes: int = 8,
+    attempts: int = 4,
+    knots: int = 12,
+    iterations: int = 45,
+    seed: int = 0,
+    workers: Workers | None = None,
+    coarse: int | None = None,
+) -> Plans:
+    """Find one plan for each of several starts, by gradients of their returns.
+
+    First, plans of some starts are found from noise around the task's first action, one an attempt.
+    Each of them is then replayed from all starts, and each start goes on from the one that serves
+    it best, with a third of the iterations. Of all iterates of a start the best is kept, by success
+    and then by return. Adam moves the knots of a plan, with betas of (.9, .95) and a rate that
+    falls linearly from .1 to .01; the gradient of each start is divided by its own norm.
+
+    A motion that cannot be made, and a simulation that fails, cost the worst reward and have no
+    gradient: a plan moves by the gradients of its other rewards.
+
+    Args:
+        make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7,
+            opens_at=-1.0, reach=.06)`.
+        episodes: E, the number of starts.
+        attempts: Number of plans that are found from noise; at most E are from different starts.
+        knots: Number of hat functions of the time.
+        iterations: Updates of a plan that begins from noise.
+        seed: Of the starts and of the noise.
+        workers: What finds plans; None finds them here, in one thread. Bits do not depend on it.
+        coarse: Vertices a side of a coarser sheet, for which `make` is called with `size=coarse`:
+            plans are found there first, with all attempts, and then improved for `make` alone. None
+            for no such stage.
+
+    Raises:
+        InvalidInput: If an argument is not accepted.
+        SimulationError: If a return or its gradient is not finite.
+    """
+    if not callable(make):
+        raise TypeError(f"plan: `make` must be a function that makes environments, got {make!r}")
+    check_count("plan: `episodes`", episodes, 1, _LARGEST_COUNT)
+    check_count("plan: `attempts`", attempts, 1, _LARGEST_COUNT)
+    check_count("plan: `knots`", knots, 2, _LARGEST_COUNT)
+    check_count("plan: `iterations`", iterations, 1, _LARGEST_COUNT)
+    check_count("plan: `seed`", seed, 0, LARGEST_SEED)
+    check_workers("plan: `workers`", workers)
+    if coarse is not None:
+        check_count("plan: `coarse`", coarse, 4, _LARGEST_COUNT)
+    task = make(num_envs=1).task
+    check_memory("plan: `knots`", knots, episodes * task.action_size * 8, "a knot")
+    check_memory("plan: `episodes`", episodes, task.horizon * task.action_size * 8, "an episode")
+    seeds = part_seeds(seed, 0, episodes)
+    draws = cpu.generator().manual_seed(seed)
+    first = cpu.tensor(task.first_action).clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
+    noise = cpu.randn(attempts, knots, len(first), generator=draws, dtype=torch.float64)
+    begun = first + _NOISE * noise
+    stage = partial(_stage, make, lru_cache(maxsize=8)(partial(_sized, make)), workers)
+    if coarse is not None:
+        _require_same_actions(make, coarse)
+        some = stage(_attempts(seeds, begun, iterations, coarse))
+        found = _refined(stage, seeds, some.knots, iterations, coarse)
+        return _refined(stage, seeds, found.knots, iterations, None).plans(seeds)
+    some = stage(_attempts(seeds, begun, iterations, None))
+    return _refined(stage, seeds, some.knots, iterations, None).plans(seeds)
+
+
+@dataclass(frozen=True, eq=False)
+class Improved:
+    """The best iterates of some starts.
+
+    Attributes:
+        knots: Before their tanh [n, K, A].
+        actions: [n, T, A].
+        returns: Sums of their rewards [n].
+        success: [n].
+    """
+
+    knots: Tensor
+    actions: Tensor
+    returns: Tensor
+    success: Tensor
+
+    def better(self, other: Improved) -> Improved:
+        """Of each start the better of two, this one where they are alike."""
+        wins = other.success & ~self.success
+        wins |= (other.success == self.success) & (other.returns > self.returns)
+        return Improved(
+            *(
+                torch.where(wins.reshape(-1, *[1] * (mine.dim() - 1)), yours, mine)
+                for mine, yours in zip(self._parts(), other._parts(), strict=True)
+            )
+        )
+
+    def rows(self, rows: Sequence[int]) -> Improved:
+        """Some of them, by their indices."""
+        return Improved(*(part[list(rows)] for part in self._parts()))
+
+    def best(self) -> int:
+        """Index of the best of them, by success and then by return."""
+        keys = zip(self.success.tolist(), self.returns.tolist(), strict=True)
+        return max(enumerate(keys), key=lambda pair: (pair[1], -pair[0]))[0]
+
+    def plans(self, seeds: Sequence[int]) -> Plans:
+        """As plans of starts of these seeds."""
+        numbers = cpu.tensor(seeds, dtype=torch.int64)
+        return Plans(self.actions, self.returns, self.success, numbers)
+
+    @staticmethod
+    def together(parts: Sequence[Improved]) -> Improved:
+        """One behind the other."""
+        columns = zip(*(part._parts() for part in parts), strict=True)
+        return Improved(*(torch.cat(tensors) for tensors in columns))
+
+    def _parts(self) -> tuple[Tensor, ...]:
+        return self.knots, self.actions, self.returns, self.success
+
+
+def improve(
+    env: ClothVectorEnv, start: EnvState, knots: Tensor, iterations: int, rate: float = _RATE
+) -> Improved:
+    """Improve plans of some environments from where they are; each by its own gradient.
+
+    Args:
+        env: Its task and its parameters count, its state stays.
+        start: After equally many transitions in all environments, without a graph.
+        knots: Of plans of whole episodes, before their tanh [n, K, A].
+        iterations: Updates; with 0 plans are only tried.
+        rate: Learning rate of Adam at first; it falls linearly to a tenth.
+
+    Returns:
+        The best iterate of each start, the first one among them; actions are those that are left.
+
+    Raises:
+        SimulationError: If a return or a gradient is not finite.
+    """
+    done = int(start.elapsed[0])
+    shares = hats(env.task.horizon, knots.shape[1])[done:]
+    free = knots.detach().clone().requires_grad_()
+    adam = torch.optim.Adam([free], lr=rate, betas=_BETAS)
+    best: Improved | None = None
+    for k in range(iterations + 1):
+        before = torch.einsum("tk,nka->nta", shares, free)
+        actions = before.detach().tanh()
+        leaf = actions.clone().requires_grad_(k < iterations)
+        with torch.set_grad_enabled(k < iterations):
+            returns, success = _followed(env, start, leaf)
+        found = Improved(free.detach().clone(), actions, returns.detach(), success)
+        best = found if best is None else best.better(found)
+        if k < iterations and returns.requires_grad:
+            (slope,) = torch.autograd.grad(returns.sum(), leaf)
+            (free.grad,) = torch.autograd.grad(before.tanh(), free, -_normalized(env, slope, k))
+            adam.param_groups[0]["lr"] = rate * (1 - (1 - _LAST_SHARE) * k / max(iterations - 1, 1))
+            with cpu.DEVICE:  # where Adam keeps its counts
+                adam.step()
+    assert best is not None
+    return best
+
+
+def hats(horizon: int, knots: int) -> Tensor:
+    """Values of hat functions at the times of transitions [T, K], which sum to 1."""
+    times = cpu.linspace(0.0, knots - 1.0, horizon)[:, None]
+    return (1 - (times - cpu.arange(knots)).abs()).clamp(min=0)
+
+
+def knots_of(actions: Tensor, knots: int) -> Tensor:
+    """Knots [E, K, A] whose plans are nearest to actions [E, T, A], before their tanh."""
+    shares = hats(actions.shape[1], knots)
+    before = actions.clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
+    return torch.stack([torch.linalg.lstsq(shares, each, driver="gelsd")[0] for each in before])
+
+
+def _followed(env: ClothVectorEnv, start: EnvState, actions: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns [n] and successes [n] of actions [n, T, A] from a state."""
+    task, place = env.task, start
+    returns = cpu.zeros(len(start))
+    success = cpu.zeros(len(start), dtype=torch.bool)
+    running = ~success
+    for k in range(actions.shape[1]):
+        place = task.transition(place, actions[:, k], env.parameters)
+        returns = returns + torch.where(running, task.outcome(place), 0.0)
+        success = torch.where(running, task.succeeded(place) & ~place.failed, success)
+        running = running & ~task.terminal(place)
+        if not bool(running.any()):
+            break
+    _require_finite(env, "return", returns.detach())
+    return returns, success
+
+
+def _normalized(env: ClothVectorEnv, slope: Tensor, iteration: int) -> Tensor:
+    """Gradients [n, T, A], each divided by its own norm; those that are zero stay so."""
+    _require_finite(env, f"gradient of iteration {iteration}", slope.sum(dim=(1, 2)))
+    norms = torch.linalg.vector_norm(slope, dim=(1, 2), keepdim=True)
+    return torch.where(norms > 0, slope / norms, 0.0)
+
+
+def _require_finite(env: ClothVectorEnv, name: str, values: Tensor) -> None:
+    wrong = ~torch.isfinite(values)
+    if bool(wrong.any()):
+        environments = wrong.nonzero()[:, 0].tolist()
+        raise SimulationError(
+            f"plan: the {name} of {env.task.name} is not finite in environments {environments}; a "
+            "square root or a norm in a reward has no derivative at 0",
+            environments=environments,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Plans that are to be improved.
+
+    Attributes:
+        seeds: Of the starts.
+        knots: [n, K, A].
+        iterations: Updates of each.
+        size: Vertices a side, in place of the size of the environments; None for the latter.
+    """
+
+    seeds: list[int]
+    knots: Tensor
+    iterations: int
+    rate: float
+    size: int | None
+
+
+def _improved(make: Callable[[int, int | None], ClothVectorEnv], piece: _Piece) -> Improved:
+    with threads_of_torch(1):
+        env = make(len(piece.seeds), piece.size)
+        env.reset(seed=piece.seeds)
+        start = env.env_state.detach()
+        return improve(env, start, piece.knots, piece.iterations, piece.rate)
+
+
+def _improved_remotely(work: tuple[bytes, _Piece]) -> Improved:
+    """Improve plans in this process, whose environments last for later ones."""
+    return _improved(partial(_made, work[0]), work[1])
+
+
+@lru_cache(maxsize=8)
+def _made(make: bytes, count: int, size: int | None) -> ClothVectorEnv:
+    return _sized(pickle.loads(make), count, size)
+
+
+def _sized(make: MakeEnv, count: int, size: int | None) -> ClothVectorEnv:
+    return make(num_envs=count) if size is None else make(num_envs=count, size=size)
+
+
+def _stage(
+    make: MakeEnv,
+    local: Callable[[int, int | None], ClothVectorEnv],
+    workers: Workers | None,
+    pieces: Sequence[_Piece],
+) -> Improved:
+    """Results of pieces, one behind the other; without workers in the local environments."""
+    if workers is None:
+        return Improved.together([_improved(local, piece) for piece in pieces])
+    name = pickled("plan: `make`", make)
+    return Improved.together(list(workers.map(_improved_remotely, [(name, p) for p in pieces])))
+
+
+_Stage = Callable[[Sequence[_Piece]], Improved]
+
+
+def _attempts(
+    seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
+) -> list[_Piece]:
+    """Plans from noise: attempt k for start k, or for start k - E and so on where E is less."""
+    chosen = [seeds[k % len(seeds)] for k in range(len(knots))]
+    return _pieces(_Piece(chosen, knots, iterations, _RATE, size))
+
+
+def _refined(
+    stage: _Stage, seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
+) -> Improved:
+    """Replay plans from all starts, and improve for each start the best of them."""
+    count = len(knots)
+    tried = stage([_Piece([seed] * count, knots, 0, _RATE, size) for seed in seeds])
+    best = [
+        first + tried.rows(range(first, first + count)).best()
+        for first in range(0, len(seeds) * count, count)
+    ]
+    few = math.ceil(iterations / _SHARE)
+    return stage(_pieces(_Piece(list(seeds), tried.knots[best], few, _RATE / _SHARE, size)))
+
+
+def _pieces(whole: _Piece) -> list[_Piece]:
+    """Parts of a piece, of equal sizes but for the last one, whatever makes them."""
+    return [
+        replace(whole, seeds=whole.seeds[k : k + _TOGETHER], knots=whole.knots[k : k + _TOGETHER])
+        for k in range(0, len(whole.seeds), _TOGETHER)
+    ]
+
+
+def _require_same_actions(make: MakeEnv, coarse: int) -> None:
+    fine, other = (_sized(make, 1, size).task for size in (None, coarse))
+    for name in ("action_size", "horizon"):
+        if getattr(fine, name) != getattr(other, name):
+            raise InvalidInput(
+                f"plan: `coarse` must leave the task's {name} as it is, "
+                f"{getattr(fine, name)}, got {getattr(other, name)} at {coarse}"
+            )
