@@ -28,7 +28,7 @@ from diffcloth_torch.config.documents import read_document, set_values
 from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.options import TrainerOptions, name_now
 from diffcloth_torch.learn.trainer import Trainer, record_of, restore
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
@@ -332,6 +332,8 @@ def _named(where: str, options: type[TrainerOptions], given: dict[str, Any]) -> 
     accepted = [field.name for field in fields(options)]
     for name in given:
         if name not in accepted:
-            raise InvalidInput(f"{where} may have {', '.join(accepted)}; got {name!r}")
+            raise InvalidInput(
+                f"{where} may have {', '.join(accepted)}; got {name!r}{name_now(name)}"
+            )
     values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
     return options(**values)

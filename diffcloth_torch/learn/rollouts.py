@@ -58,7 +58,7 @@ class Policy(torch.nn.Module):
             observations,
             cpu.tensor(first, dtype=torch.float32),
             options.hidden,
-            options.deviation,
+            options.init_std,
             sees_width=options.has_entropy,
             knots=options.plan_knots,
         )

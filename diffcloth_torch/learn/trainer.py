@@ -139,15 +139,15 @@ class Trainer:
         plan = self.policy.actor.plan
         knots = [] if plan is None else [plan.knots]
         others = [p for p in self.policy.actor.parameters() if all(p is not k for k in knots)]
-        groups = [{"params": others, "lr": o.actor_rate}]
-        groups += [{"params": knots, "lr": o.plan_rate}] if knots else []
+        groups = [{"params": others, "lr": o.learning_rate}]
+        groups += [{"params": knots, "lr": o.plan_learning_rate}] if knots else []
         adam = TensorAdam if o.scale == "tensor" else torch.optim.Adam
         self._actor_steps = adam(groups, betas=o.betas)
         self._critic_steps = torch.optim.Adam(
-            self.policy.critics.parameters(), lr=o.critic_rate, betas=o.betas
+            self.policy.critics.parameters(), lr=o.critic_learning_rate, betas=o.betas
         )
         self._temperature_steps = torch.optim.Adam(
-            [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
+            [self.policy.log_temperature], lr=o.temperature_learning_rate, betas=o.betas
         )
         self.steps = self.updates = 0
         self._return = cpu.zeros(num_envs, dtype=torch.float32)
@@ -187,10 +187,10 @@ class Trainer:
 
     def _update(self) -> dict[str, float]:
         o, share = self.options, self.options.rate_share(self.updates)
-        rates = o.actor_rate, o.plan_rate
+        rates = o.learning_rate, o.plan_learning_rate
         for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
             group["lr"] = share * rate
-        self._critic_steps.param_groups[0]["lr"] = share * o.critic_rate
+        self._critic_steps.param_groups[0]["lr"] = share * o.critic_learning_rate
         rollouts = self._rollouts()
         log = {"loss": sum(r.loss for r in rollouts)}
         learns = not self.options.has_critic or self.updates >= self.options.critic_only
@@ -415,7 +415,7 @@ class Trainer:
                 gradient += rollout.gradients[k]
             parameter.grad = gradient
         parameters = list(self.policy.actor.parameters())
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.gradient_norm)
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.max_grad_norm)
         if not bool(torch.isfinite(norm)):
             raise SimulationError(
                 f"Trainer.update: the gradient of update {self.updates} is not finite; a square "
@@ -432,7 +432,7 @@ class Trainer:
             # The least opinion: what one critic alone overestimates a policy would climb.
             values = policy.targets(policy.scale(rows.after)).amin(dim=0)
             rewards = rows.rewards + policy.temperature * rows.entropies
-            goals = _lambda_returns(rows, rewards, values, o.discount, o.trace).flatten()
+            goals = _lambda_returns(rows, rewards, values, o.discount, o.gae_lambda).flatten()
             seen = policy.scale(rows.seen).flatten(0, 1)
         losses = []
         for _ in range(o.critic_epochs):
@@ -447,7 +447,7 @@ class Trainer:
         with torch.no_grad():
             pairs = zip(policy.targets.parameters(), policy.critics.parameters(), strict=True)
             for slow, fast in pairs:
-                slow.lerp_(fast, o.target_rate)
+                slow.lerp_(fast, o.tau)
         return sum(losses) / len(losses)
 
     def _step_temperature(self, entropy: float) -> None:
