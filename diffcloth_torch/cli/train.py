@@ -15,11 +15,11 @@ from tqdm import tqdm
 from diffcloth_torch import envs
 from diffcloth_torch.checkpoint import check_like, refusing_damage
 from diffcloth_torch.cli.results import (
-    RESUME,
     check_folder,
     clear,
     read_resume,
     results_folder,
+    resume_file,
     resumed_folder,
     write_metrics,
     write_resume,
@@ -92,7 +92,7 @@ def resume_training(folder: Path) -> str:
 
 def _resumed(folder: Path, kept: dict[str, Any], workers: _Workers) -> str:
     job = _Job(_check(kept["config"], kept["source"]), kept["source"], workers)
-    with refusing_damage("--resume", folder / RESUME):
+    with refusing_damage("--resume", resume_file(folder, "train")):
         evaluations = job.restore(kept)
     return job.run(folder, evaluations)
 

@@ -135,7 +135,7 @@ class Trainer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(o.seed)
             self.policy = Policy(self._env, o)
-        self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
+        self._places = self._begin_all()
         plan = self.policy.actor.plan
         knots = [] if plan is None else [plan.knots]
         others = [p for p in self.policy.actor.parameters() if all(p is not k for k in knots)]
@@ -262,11 +262,14 @@ class Trainer:
         own = self._record()
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
-        if given["task"] != own["task"]:
-            raise InvalidInput(f"{owner} is of {given['task']}, not of {own['task']}")
-        if given["options"] != own["options"]:
+        _require_task(owner, given["task"], own["task"])
+        # An earlier version did not have the other options.
+        if asdict(TrainerOptions()) | dict(given["options"]) != own["options"]:
             raise InvalidInput(f"{owner} was written with other options")
-        places = self._checked_places(owner, given["places"])
+        if given["places"] is None:  # a file of 0.1
+            places = self._begin_all()
+        else:
+            places = self._checked_places(owner, given["places"])
         check_like(f"{owner}['counts']", given["counts"], own["counts"])
         steps, updates = given["counts"]
         if steps != updates * self.options.horizon * self._count:
@@ -333,6 +336,8 @@ class Trainer:
     def load(self, path: str | Path) -> None:
         """Go on with the content of a file of `save`, to the same bits.
 
+        With a file of 0.1, which keeps no environments, all episodes begin anew.
+
         Raises:
             InvalidInput: If it is no such file, is damaged, or is of another task, of other
                 options, or of environments in other chunks. The trainer is then as before.
@@ -353,7 +358,7 @@ class Trainer:
             "name": task.name,
             "actions": task.action_size,
             "observations": sizes,
-            "frame": task.frame,
+            "frame": task.frame if "frame_axes" in task.example().drawn else "world",
             "horizon": task.horizon,
             "substeps": task.substeps,
             "vertices": len(task.simulator.initial_state().positions),
@@ -366,6 +371,9 @@ class Trainer:
     @property
     def _chunks(self) -> range:
         return range(0, self._count, self._chunk)
+
+    def _begin_all(self) -> list[tuple[EnvState, list[Tensor]]]:
+        return [self._begin(range(k, k + self._chunk)) for k in self._chunks]
 
     def _begin(self, numbers: Sequence[int]) -> tuple[EnvState, list[Tensor]]:
         """Environments by their numbers, each of which has a seed of its own."""
@@ -488,6 +496,25 @@ def restore(trainer: Trainer, record: Any) -> None:
             return. The trainer is then as before.
     """
     trainer._load("the trainer", record)
+
+
+def _require_task(owner: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Require the description of a task of which a policy can go on."""
+    if given == own:
+        return
+    if not {"name", "frame", "observations"} <= given.keys() or given["name"] != own["name"]:
+        raise InvalidInput(f"{owner} is of {given}, not of {own}")
+    if given["observations"] != own["observations"]:
+        raise InvalidInput(
+            f"{owner} has learned from other observations of {own['name']}: "
+            f"{given['observations']}, which are {own['observations']} now; it must learn anew"
+        )
+    if given["frame"] != own["frame"]:
+        raise InvalidInput(
+            f"{owner} has learned from observations of {own['name']} in the axes of the "
+            f"{given['frame']}: make the task with frame={given['frame']!r}"
+        )
+    raise InvalidInput(f"{owner} is of {given}, not of {own}")
 
 
 class _Rows:
