@@ -140,6 +140,7 @@ WITHOUT_REFUSAL = {
     "Fit",
     "Parameters",
     "Parameters.replace",
+    "Simulator.default_parameters",
     "Simulator.parameters",
     "Stage",
     "State",

@@ -56,7 +56,7 @@ def test_a_batch_says_so(simulator):
 
 
 def test_parameters_say_numbers_and_shapes(simulator):
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     text = lines(given)
     assert text.startswith("Parameters(stretch=550, bending=1e-05, poisson=0.3, density=0.124")
     assert "gravity=[0, 0, -9.81]" in text

@@ -249,7 +249,7 @@ def values_used(task: ConfiguredTask) -> dict[str, Any]:
     parameters except the rest positions, which are those of the mesh.
     """
     simulator = task.simulator
-    parameters = simulator.parameters()
+    parameters = simulator.default_parameters()
     values = {name: getattr(parameters, name) for name in PARAMETERS if name != "rest_positions"}
     given = {name: value.tolist() for name, value in values.items() if value is not None}
     chosen = {name: given.get(name) for name in ("barrier_distance", "barrier_stiffness")}

@@ -11,7 +11,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.autograd.guards import guarded
 from diffcloth_torch.checks import check_bool, check_count, check_shape
 from diffcloth_torch.dynamics.totals import Totals
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, Fields
 from diffcloth_torch.operations import label
@@ -228,9 +228,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: Literal[False] = False,
     ) -> Tensor: ...
 
@@ -238,9 +238,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: Literal[True],
     ) -> dict[str, Tensor]: ...
 
@@ -248,9 +248,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: bool = False,
     ) -> Tensor | dict[str, Tensor]:
         """Potential energy at the positions of a state: elasticity, springs, gravity, contact.
@@ -268,11 +268,10 @@ class Observables:
         call; a second derivative is refused.
 
         Args:
-            state: Where things are.
+            state: The state.
+            control: A control, as of a step, of which `attachments`, `attachment_weights` and
+                `soft_pins` store energy; its other fields do not count.
             parameters: Physical parameters; None takes those of the scene.
-            control: What acts there, as in a step. Of it `attachments`, `attachment_weights` and
-                `soft_pins` store energy; the rest, as forces and the motion of pins and bodies,
-                counts for nothing.
             parts: Whether to return what adds up to the energy.
 
         Returns:
@@ -285,6 +284,14 @@ class Observables:
             SimulationError: In backward, if surfaces overlap: the energy is infinite there.
         """
         check_bool("energy: `parts`", parts)
+        second: object = control
+        if isinstance(second, Parameters) and parameters is None:  # the order of 0.1
+            warn_caller(
+                "energy: the order is (state, control, parameters): write energy(state, "
+                "parameters=...)",
+                FutureWarning,
+            )
+            control, parameters = None, second
         given, batch = self._border.enter(state, control, parameters)
         if control is not None:
             unset = self._border.enter(state, None, None)[0].control
