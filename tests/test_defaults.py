@@ -252,7 +252,7 @@ def test_gradients_wherever_backward_runs(world, where):
             own = hung.default_parameters().replace(gravity=gravity)
             rest = hung.equilibrium(hung.initial_state(), None, own)
             value = end.positions.sum() + end.joint_positions.sum() + rest.positions.sum()
-            value = value + sim.energy(end, given.replace(gravity=gravity)).sum()
+            value = value + sim.energy(end, None, given.replace(gravity=gravity)).sum()
             if where == "inside":
                 value.backward()
         if where == "outside":
