@@ -12,6 +12,7 @@ from torch import Tensor
 from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
+    ArrayLike,
     check_finite,
     check_range,
     check_shape,
@@ -36,10 +37,10 @@ __all__ = ["markers", "outline", "point_cloud"]
 
 def markers(
     states: Sequence[State],
-    observed: object,
-    weights: object = None,
+    observed: ArrayLike,
+    weights: ArrayLike | None = None,
     *,
-    vertices: object = None,
+    vertices: ArrayLike | None = None,
     noise: float = 1.0,
 ) -> Tensor:
     """Positions of marked vertices less those observed, over the noise.
@@ -96,7 +97,9 @@ def markers(
     return difference.flatten()[mask.flatten().nonzero()[:, 0]]
 
 
-def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: float = 1.0) -> Tensor:
+def point_cloud(
+    states: Sequence[State], clouds: Sequence[ArrayLike], *, noise: float = 1.0
+) -> Tensor:
     """Each observed point less the vertex of the cloths that is nearest to it, over the noise.
 
     One-sided, from what was seen to what is simulated: parts that no camera saw do not count. Which

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import (
     POSITIVE,
+    ArrayLike,
     FloatArray,
     Range,
     check_bool,
@@ -55,12 +56,12 @@ class Variable:
             nothing but the bounds.
     """
 
-    value: object
+    value: ArrayLike
     bounds: tuple[float, float] | None = None
     scale: Literal["log", "linear"] | None = None
     free: bool = True
     spread: float = 3.0
-    prior: tuple[object, object] | None = None
+    prior: tuple[ArrayLike, ArrayLike] | None = None
 
     def __post_init__(self) -> None:
         numbers = float_array("Variable: `value`", self.value).copy()
