@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.saved_0_1 import OPTIONS
 
 __all__ = ["ALGORITHMS", "SCALES", "TrainerOptions", "name_now"]
@@ -118,6 +119,8 @@ class TrainerOptions(_RefusesOldNames):
     plan_learning_rate: float = 4e-2
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)

@@ -41,6 +41,7 @@ from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of
 from diffcloth_torch.optimize.variables import Space, Variable
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
@@ -93,6 +94,8 @@ class Fit:
     held_out: list[float]
     history: list[Trial] = field(repr=False)
     compared: list[Residuals] = field(repr=False)
+
+    __repr__ = dataclass_text
 
     @property
     def failures(self) -> int:

@@ -26,6 +26,7 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.variables import Space
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = [
@@ -75,6 +76,8 @@ class Trial:
     values: dict[str, Tensor]
     seconds: float
     failure: str = ""
+
+    __repr__ = dataclass_text
 
 
 class Memory:

@@ -26,6 +26,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.reprs import dataclass_text
 
 __all__ = ["Space", "Variable"]
 
@@ -62,6 +63,8 @@ class Variable:
     free: bool = True
     spread: float = 3.0
     prior: tuple[ArrayLike, ArrayLike] | None = None
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         numbers = float_array("Variable: `value`", self.value).copy()
