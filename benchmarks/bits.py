@@ -87,9 +87,10 @@ def measure(case: Case) -> tuple[str, str]:
     fields = {
         name: value.clone().requires_grad_()
         for name in dc.Parameters.__dataclass_fields__
-        if not name.startswith("_") and (value := getattr(simulator.parameters(), name)) is not None
+        if not name.startswith("_")
+        and (value := getattr(simulator.default_parameters(), name)) is not None
     }
-    parameters = simulator.parameters().replace(**fields)
+    parameters = simulator.default_parameters().replace(**fields)
     start = {name: getattr(state, name).detach().clone().requires_grad_() for name in START}
     state = state.replace(**start)
     for _ in range(STEPS):

@@ -81,7 +81,7 @@ PAIRS = {"free body": body, "gripper": gripper}
 
 def same_barrier(simulators: list[dc.Simulator]) -> list[dc.Simulator]:
     """Give both the stiffest barrier that a pair of the first has, for its free bodies."""
-    stiffness = float(simulators[0].parameters().barrier_stiffness.max())
+    stiffness = float(simulators[0].default_parameters().barrier_stiffness.max())
     contact = dc.ContactOptions(barrier_stiffness=stiffness)
     return [dc.Simulator(simulator.scene, DT, contact=contact) for simulator in simulators]
 

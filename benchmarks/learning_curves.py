@@ -49,11 +49,19 @@ ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
 # planned policy with one scale for each tensor.
 VARIANTS = ("hard", "feedback", "scaled")
 # Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
-COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "deviation": 0.05, "target_entropy": -2.0}
-APG: dict[str, Any] = {"discount": 1.0, "actor_rate": 4e-3}
-PLANNED: dict[str, Any] = APG | {"plan_knots": 12, "plan_rate": 0.03, "actor_rate": 6e-4}
-SCALED: dict[str, Any] = PLANNED | {"scale": "tensor", "plan_rate": 0.02, "actor_rate": 3e-4}
-WITH_CRITIC = {"discount": 0.99, "actor_rate": 2e-3}
+COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "init_std": 0.05, "target_entropy": -2.0}
+APG: dict[str, Any] = {"discount": 1.0, "learning_rate": 4e-3}
+PLANNED: dict[str, Any] = APG | {
+    "plan_knots": 12,
+    "plan_learning_rate": 0.03,
+    "learning_rate": 6e-4,
+}
+SCALED: dict[str, Any] = PLANNED | {
+    "scale": "tensor",
+    "plan_learning_rate": 0.02,
+    "learning_rate": 3e-4,
+}
+WITH_CRITIC = {"discount": 0.99, "learning_rate": 2e-3}
 NUM_ENVS, FREE_ENVS = 2, 4
 LABELS = {"plan": "plan", "planned": "APG, planned"}
 KNOTS, PLAN_RATE = 10, 0.02  # of a plan: actions that last a tenth of an episode

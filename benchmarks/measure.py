@@ -260,8 +260,9 @@ def contact_share(simulator: dc.Simulator, state: dc.State) -> float:
     all_vertices, all_faces = np.concatenate(vertices), np.concatenate(faces)
     mesh = ipctk.CollisionMesh(all_vertices, ipctk.edges(all_faces), all_faces)
     collisions = ipctk.NormalCollisions()
-    distance = simulator.parameters().barrier_distance
-    collisions.build(mesh, all_vertices, distance.item())
+    # 0.1, to compare with, has the other name.
+    own = getattr(simulator, "default_parameters", None) or simulator.parameters
+    collisions.build(mesh, all_vertices, own().barrier_distance.item())
     touched = {
         int(vertex)
         for k in range(len(collisions))

@@ -30,7 +30,7 @@ def residuals_of(size: int, steps: int) -> Callable[[torch.Tensor], torch.Tensor
     sim = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.sphere(0.25)]), dt=0.01)
     with torch.no_grad():
         start = sim.rollout(sim.initial_state(), steps=10)[-1]
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
 
     def residuals(values: torch.Tensor) -> torch.Tensor:
         given = parameters.replace(**dict(zip(NAMES, values, strict=True)))

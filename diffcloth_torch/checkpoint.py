@@ -2,7 +2,8 @@
 
 A file is an archive of `torch.save`, which `torch.load` reads, followed by a record: JSON with the
 format, the kind of content and the version of the package; a digest of everything before it; the
-length of the JSON; and a mark. The digest is verified before anything is unpickled.
+length of the JSON; and a mark. The digest is verified before anything is unpickled. Files of 0.1
+have the archive alone.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import hashlib
 import json
 import math
 import os
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -26,6 +28,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.checks import LARGEST_COUNT
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import open_regular_file, replace_file
+from diffcloth_torch.saved_0_1 import CHECKPOINTS
 
 __all__ = [
     "FORMAT",
@@ -47,6 +50,9 @@ _LENGTH_SIZE = 4
 _LARGEST_RECORD = 4096  # bytes of JSON
 _END_SIZE = _DIGEST_SIZE + _LENGTH_SIZE + len(_MARK)
 _CHUNK = 1 << 20  # bytes that are hashed at once
+
+_ARCHIVE, _ARCHIVE_END = b"PK\x03\x04", b"PK\x05\x06"  # signatures of a ZIP file
+_ARCHIVE_REST = 18  # bytes after the second one, the last two of which count those of a comment
 
 
 def write_checkpoint(path: Path, kind: str, content: object) -> None:
@@ -85,6 +91,10 @@ def read_checkpoint(owner: str, path: Path, *kinds: str) -> Any:
         OSError: If it cannot be read.
     """
     with open_regular_file(path) as file:
+        old = [kind for kind in kinds if kind in CHECKPOINTS]
+        if old and _is_of_0_1(file):
+            return _read_0_1(owner, path, file, old[0])
+        file.seek(0)
         record = _record(owner, path, file)
         if record["format"] != FORMAT:
             raise InvalidInput(
@@ -102,6 +112,25 @@ def read_checkpoint(owner: str, path: Path, *kinds: str) -> Any:
             return torch.load(file, map_location=cpu.DEVICE, weights_only=True)
 
 
+def _is_of_0_1(file: BinaryIO) -> bool:
+    """Whether a file begins and ends as an archive without a comment."""
+    start = file.read(len(_ARCHIVE))
+    file.seek(max(os.fstat(file.fileno()).st_size - len(_ARCHIVE_END) - _ARCHIVE_REST, 0))
+    end = file.read()
+    return start == _ARCHIVE and end.startswith(_ARCHIVE_END) and end.endswith(b"\0\0")
+
+
+def _read_0_1(owner: str, path: Path, file: BinaryIO, kind: str) -> Any:
+    with refusing_damage(owner, path):
+        # torch does not verify the checksums of an archive.
+        damaged = zipfile.ZipFile(file).testzip()
+        if damaged is not None:
+            raise InvalidInput(f"its entry {damaged} was changed since it was written")
+        file.seek(0)
+        content = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
+        return CHECKPOINTS[kind](content)
+
+
 def _record(owner: str, path: Path, file: BinaryIO) -> dict[str, Any]:
     size = os.fstat(file.fileno()).st_size
     file.seek(max(size - _END_SIZE, 0))
@@ -109,7 +138,7 @@ def _record(owner: str, path: Path, file: BinaryIO) -> dict[str, Any]:
     if len(end) < _END_SIZE or not end.endswith(_MARK):
         raise InvalidInput(
             f"{owner}: {path} is no complete checkpoint: it was cut off, or was written by another "
-            "program or by diffcloth_torch before 0.2.0"
+            "program"
         )
     length = int.from_bytes(end[_DIGEST_SIZE : -len(_MARK)], "little")
     before = size - _END_SIZE - length

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -28,6 +29,7 @@ __all__ = [
     "POISSON",
     "POSITIVE",
     "SMALLEST",
+    "ArrayLike",
     "FloatArray",
     "IndexArray",
     "Range",
@@ -50,6 +52,9 @@ __all__ = [
     "refuse_threads",
     "texts",
 ]
+
+ArrayLike = npt.ArrayLike | Tensor
+"""Numbers as given: an array, a tensor without a graph, a number, or lists of them."""
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import reprlib
+import textwrap
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,11 @@ from torch import Tensor
 
 from diffcloth_torch.autograd.transforms import is_dense
 
-__all__ = ["field_text", "record_text", "value_text"]
+__all__ = ["dataclass_text", "field_text", "record_text", "value_text"]
 
 _MOST_NUMBERS = 4
+_MOST_ENTRIES = 8  # of a mapping
+_PLAIN = (str, int, float, type(None))
 _LINE = 88
 
 
@@ -33,9 +37,24 @@ def value_text(value: object) -> str:
             return _numbers_text(value)
         return f"{value.dtype}{list(value.shape)}"
     if isinstance(value, Mapping):
-        entries = (f"{name!r}: {value_text(entry)}" for name, entry in value.items())
-        return f"{{{', '.join(entries)}}}"
+        entries = [f"{name!r}: {value_text(entry)}" for name, entry in value.items()]
+        more = [f"and {len(entries) - _MOST_ENTRIES} more"] if len(entries) > _MOST_ENTRIES else []
+        return f"{{{', '.join(entries[:_MOST_ENTRIES] + more)}}}"
+    if is_dataclass(value):
+        return f"{type(value).__name__}(...)"
+    if isinstance(value, tuple) and len(value) <= _MOST_NUMBERS:
+        return f"({', '.join(map(value_text, value))})"
+    if isinstance(value, list | tuple) and not all(isinstance(v, _PLAIN) for v in value):
+        kinds = sorted({type(v).__name__ for v in value})
+        return f"[{len(value)} {' or '.join(kinds)}]"
     return reprlib.repr(value)
+
+
+def dataclass_text(value: Any) -> str:
+    """Text of a dataclass, by its fields that are to be shown."""
+    shown = [field.name for field in fields(value) if field.repr]
+    parts = [field_text(name, getattr(value, name)) for name in shown]
+    return record_text(type(value).__name__, parts)
 
 
 def field_text(name: str, value: object) -> str:
@@ -49,6 +68,10 @@ def record_text(kind: str, parts: Iterable[str]) -> str:
     lines = [f"{kind}({first}"]
     for part in rest[:-1]:
         lines[-1] += ","
+        if len(part) > _LINE:
+            wrapped = textwrap.wrap(part, _LINE - 4, break_long_words=False)
+            lines += textwrap.indent("\n".join(wrapped), 4 * " ").splitlines()
+            continue
         if len(lines[-1]) + len(part) + 1 < _LINE:
             lines[-1] += f" {part}"
         else:

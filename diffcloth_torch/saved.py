@@ -4,7 +4,7 @@ A pickle of an object whose class is `saved` holds the function `restore`, the n
 the number of the format and the fields of the object. Arrays and slices in the fields become calls
 of functions here, as `torch.load` does not trust those that their own pickles name. With
 `weights_only` it reads these files as soon as `diffcloth_torch.sim` has been imported, which any
-public name does. Files of 0.1 name modules instead; `_MODULES_0_1` has their paths.
+public name does. Files of 0.1 name modules instead; `saved_0_1.py` has their paths.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.saved_0_1 import MODULES
 
 __all__ = ["FORMAT", "read_saved_objects", "restore", "restore_array", "restore_slice", "saved"]
 
@@ -55,16 +56,6 @@ _MODULES = {
     "Surfaces": "sim.records.surfaces",
 }
 """Class that files name -> its module."""
-
-_MODULES_0_1 = {
-    "sim.contact_points": ("ContactPoints",),
-    "sim.contacts": ("Contacts",),
-    "sim.controls": ("Control", "Parameters"),
-    "sim.report": ("Report",),
-    "sim.state": ("State",),
-    "sim.surfaces": ("LinkSurfaces", "Surfaces"),
-}
-"""Module that files of 0.1 name, where there is none now -> its classes."""
 
 # Reads classes at a path other than their own since this version of torch.
 _OTHER_PATHS = (2, 6)
@@ -176,7 +167,7 @@ def read_saved_objects() -> None:
 
     torch.serialization.add_safe_globals([restore, restore_array, restore_slice])
     release = tuple(int(part) for part in torch.__version__.split(".")[:2])
-    for module, names in _MODULES_0_1.items():
+    for module, names in MODULES.items():
         classes = [_class(name) for name in names]
         sys.modules[f"{_PACKAGE}.{module}"] = sys.modules[classes[0].__module__]
         if release >= _OTHER_PATHS:

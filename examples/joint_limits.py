@@ -53,7 +53,7 @@ simulator = dc.Simulator(scene, dt=0.01)
 
 motors = ("as in the file", "slow", "with friction", "weak")
 limits = torch.tensor([[3.0], [3.0], [3.0], [0.5]], dtype=F64, requires_grad=True)
-parameters = simulator.parameters().replace(
+parameters = simulator.default_parameters().replace(
     joint_effort_limits=limits,
     joint_velocity_limits=torch.tensor([[4.0], [1.0], [4.0], [4.0]], dtype=F64),
     joint_friction=torch.tensor([[0.0], [0.0], [1.0], [0.0]], dtype=F64),

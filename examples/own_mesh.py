@@ -14,7 +14,7 @@ import diffcloth_torch as dc
 cloth = dc.Cloth.load(sys.argv[1], material=dc.Material(stretch=300, friction=0.4), name="cloth")
 low, high = cloth.vertices.min(axis=0), cloth.vertices.max(axis=0)
 x, y = (low + high)[:2] / 2
-gap = dc.Simulator(dc.Scene([cloth]), dt=0.01).parameters().barrier_distance.item()
+gap = dc.Simulator(dc.Scene([cloth]), dt=0.01).default_parameters().barrier_distance.item()
 floor = dc.RigidBody.plane(10 * (high - low).max(), pose=[x, y, low[2] - gap, 1, 0, 0, 0])
 simulator = dc.Simulator(dc.Scene([cloth], [floor]), dt=0.01)
 
@@ -23,7 +23,7 @@ throw = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64, requires_grad=True)  
 friction = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
 states = simulator.rollout(
     start.replace(velocities=throw.expand_as(start.positions)),
-    parameters=simulator.parameters().replace(friction=friction),
+    parameters=simulator.default_parameters().replace(friction=friction),
     steps=20,
 )
 

@@ -40,7 +40,7 @@ def inputs_of(sim, step: Callable[[], object]):
             step()
     finally:
         sim._engine.core = spy.core
-    rest = sim.parameters().rest_positions.detach().numpy()[None]
+    rest = sim.default_parameters().rest_positions.detach().numpy()[None]
     return spy.core, {"rest_positions": rest, **spy.inputs}
 
 

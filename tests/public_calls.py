@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, fields
@@ -88,6 +89,17 @@ class Call:
 
 def call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Call:
     return Call(function, arguments, keywords)
+
+
+def quiet(alias: Callable[[], Any]) -> Callable[[], Any]:
+    """An alias without the warning of its name."""
+
+    def result() -> Any:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            return alias()
+
+    return result
 
 
 def f64(values: Any) -> torch.Tensor:
@@ -178,7 +190,7 @@ class World:
 
     @cached_property
     def parameters(self):
-        return self.sim.parameters()
+        return self.sim.default_parameters()
 
     @cached_property
     def control(self):
@@ -414,18 +426,17 @@ CALLS: dict[str, Callable[[World], Call]] = {
         joint_positions={"left_finger_joint": 0.01},
         wind=[0.1, 0.0, 0.0],
     ),
-    "Simulator.energy": lambda w: call(
-        w.sim.energy, w.state, w.parameters, control=w.control, parts=True
-    ),
+    "Simulator.default_parameters": lambda w: call(w.sim.default_parameters),
+    "Simulator.energy": lambda w: call(w.sim.energy, w.state, w.control, w.parameters, parts=True),
     "Simulator.equilibrium": lambda w: call(
-        w.hung.equilibrium, w.hung.initial_state(), dc.Control(), w.hung.parameters()
+        w.hung.equilibrium, w.hung.initial_state(), dc.Control(), w.hung.default_parameters()
     ),
     "Simulator.initial_state": lambda w: call(w.sim.initial_state, 2),
     "Simulator.kinetic_energy": lambda w: call(w.sim.kinetic_energy, w.state, w.parameters),
     "Simulator.link_poses": lambda w: call(w.sim.link_poses, w.state),
     "Simulator.link_velocities": lambda w: call(w.sim.link_velocities, w.state, w.parameters),
     "Simulator.momentum": lambda w: call(w.sim.momentum, w.state, w.parameters),
-    "Simulator.parameters": lambda w: call(w.sim.parameters),
+    "Simulator.parameters": lambda w: call(quiet(w.sim.parameters)),
     "Simulator.path": lambda w: call(w.sim.path, w.state, w.control, w.parameters),
     "Simulator.rollout": lambda w: call(
         w.sim.rollout, w.start, [w.control, None], w.parameters, checkpoint_every=1

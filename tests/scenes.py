@@ -48,15 +48,17 @@ class Case:
         control = {name: given[f"control.{name}"] for name in self.control}
         parameters = {k[11:]: v for k, v in given.items() if k.startswith("parameters.")}
         return self.sim.step(
-            state, dc.Control(**control), self.sim.parameters().replace(**parameters)
+            state, dc.Control(**control), self.sim.default_parameters().replace(**parameters)
         )
 
     def inputs(self) -> dict[str, torch.Tensor]:
         """All differentiable inputs of the step by name: those of the state, control.*, ..."""
         tensors = {f"state.{name}": getattr(self.state, name) for name in STATE}
         tensors |= {f"control.{name}": tensor for name, tensor in self.control.items()}
-        names = [n for n, t in vars(self.sim.parameters()).items() if isinstance(t, torch.Tensor)]
-        defaults = self.sim.parameters()
+        names = [
+            n for n, t in vars(self.sim.default_parameters()).items() if isinstance(t, torch.Tensor)
+        ]
+        defaults = self.sim.default_parameters()
         for name in names:
             tensors[f"parameters.{name}"] = self.parameters.get(name, getattr(defaults, name))
         return {name: t.detach() for name, t in tensors.items() if t.numel()}

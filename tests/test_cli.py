@@ -280,7 +280,7 @@ def test_metrics_hold_defaults_as_they_were_used(call, tmp_path):
     used = json.loads((tmp_path / "results/sheet/metrics.json").read_text())["used"]
     cloth = dc.Cloth.grid(4, 4, pins={"corner": [0]})
     simulator = dc.Simulator(dc.Scene([cloth]), 0.01)
-    parameters = simulator.parameters()
+    parameters = simulator.default_parameters()
     assert used["contact"]["barrier_distance"] == parameters.barrier_distance.item()
     assert used["contact"]["barrier_stiffness"] == parameters.barrier_stiffness.item()
     assert used["contact"]["friction_iterations"] == dc.ContactOptions().friction_iterations

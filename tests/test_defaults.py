@@ -243,16 +243,16 @@ def test_gradients_wherever_backward_runs(world, where):
 
     def gradient(form):
         with form:
-            given = sim.parameters()
+            given = sim.default_parameters()
             gravity = given.gravity.clone().requires_grad_()
             start = sim.initial_state(2)
             end = sim.rollout(
                 start, parameters=given.replace(gravity=gravity), steps=2, checkpoint_every=1
             )[-1]
-            own = hung.parameters().replace(gravity=gravity)
+            own = hung.default_parameters().replace(gravity=gravity)
             rest = hung.equilibrium(hung.initial_state(), None, own)
             value = end.positions.sum() + end.joint_positions.sum() + rest.positions.sum()
-            value = value + sim.energy(end, given.replace(gravity=gravity)).sum()
+            value = value + sim.energy(end, None, given.replace(gravity=gravity)).sum()
             if where == "inside":
                 value.backward()
         if where == "outside":
@@ -283,10 +283,10 @@ def test_jacobians(same, world):
 
     def jacobian():
         def ends(gravity):
-            given = sim.parameters().replace(gravity=gravity)
+            given = sim.default_parameters().replace(gravity=gravity)
             return sim.step(sim.initial_state(), None, given).positions
 
-        gravity = sim.parameters().gravity
+        gravity = sim.default_parameters().gravity
         return torch.func.jacfwd(ends)(gravity), torch.func.jacrev(ends)(gravity)
 
     same(jacobian)

@@ -166,7 +166,7 @@ def test_creep_is_that_of_the_guide(load):
     contact = dc.ContactOptions(barrier_distance=0.004, slip_velocity=slip)
     scene = dc.Scene([cloth], [dc.RigidBody.plane(50.0)])
     simulator = dc.Simulator(scene, 0.01, contact=contact)
-    parameters = simulator.parameters().replace(
+    parameters = simulator.default_parameters().replace(
         friction=friction,
         gravity=torch.tensor([load * friction * 9.81, 0.0, -9.81], dtype=torch.float64),
     )

@@ -141,6 +141,7 @@ WITHOUT_REFUSAL = {
     "Fit.lines",
     "Parameters",
     "Parameters.replace",
+    "Simulator.default_parameters",
     "Simulator.parameters",
     "Stage",
     "State",

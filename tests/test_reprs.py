@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch.sim.records.contacts import Contacts
 
 F64 = torch.float64
 FEW = 10  # lines, of at most the width of a terminal
@@ -56,7 +57,7 @@ def test_a_batch_says_so(simulator):
 
 
 def test_parameters_say_numbers_and_shapes(simulator):
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     text = lines(given)
     assert text.startswith("Parameters(stretch=550, bending=1e-05, poisson=0.3, density=0.124")
     assert "gravity=[0, 0, -9.81]" in text
@@ -136,3 +137,64 @@ def test_what_a_scene_is_made_of(simulator):
 def test_a_coupling_that_was_chosen_is_said(simulator):
     other = dc.Simulator(simulator.scene, 0.01, coupling="rigid_to_cloth")
     assert repr(other).endswith("scheme='coupled', coupling='rigid_to_cloth')")
+
+
+def line_residuals(parameters, values):
+    grid = torch.linspace(0, 1, 9, dtype=F64)
+    return values["slope"] * grid + values["offset"] - 2 * grid - 1 + 0 * values["many"].sum()
+
+
+def test_a_fit_and_its_parts_show_numbers_and_shapes():
+    variables = {
+        "slope": dc.Variable(1.0),
+        "offset": dc.Variable(0.0, scale="linear"),
+        "many": dc.Variable(np.zeros(100), scale="linear", free=False),
+    }
+    assert "value=float64[100]" in lines(variables["many"])
+    fit = dc.fit(variables, line_residuals)
+    text = lines(fit)
+    assert "values={'slope': 2, 'offset': 1, 'many': float64[100]}" in text
+    assert "residuals=float64[9]" in text
+    assert "starts=[1 Start]" in text
+    assert "history" not in text
+    assert "first={'slope': 1, 'offset': 0, 'many': float64[100]}" in lines(fit.starts[0])
+    assert lines(fit.history[0]).startswith("Trial(start=0, stage=0, cost=10.5938, ")
+
+
+def test_a_descent_shows_its_best_loss_and_how_many_records_there_are():
+    def simulate(given):
+        start = falling.initial_state()
+        return [falling.step(start.replace(velocities=given["v"].expand(9, 3)))]
+
+    falling = dc.Simulator(dc.Scene([dc.Cloth.grid((3, 3))]), 0.01)
+    variables = {"v": torch.zeros(3, dtype=F64, requires_grad=True)}
+    found = dc.descend(
+        simulate,
+        lambda states: states[0].positions.mean(),
+        variables,
+        lambda given: torch.optim.SGD(given, lr=0.1),
+        iterations=2,
+    )
+    text = lines(found)
+    assert "best=Evaluation(...)" in text
+    assert "history=[2 dict]" in text
+    assert "states=[1 State]" in lines(found.best)
+
+
+def test_a_state_of_environments_shows_shapes():
+    env = dc.envs.make("FoldCloth", num_envs=2, size=4)
+    env.reset(seed=0)
+    text = lines(env.env_state)
+    assert text.startswith("EnvState(state=State(...), tools={'points': float64[2, 2, 3], ")
+    assert "and 5 more}" in text
+    lines(env.task.simulator.solver)
+    assert "learning_rate=0.002" in lines(dc.learn.TrainerOptions())
+
+
+def test_contacts_of_many_surfaces_are_counted_in_the_end():
+    names = [f"body {k}" for k in range(12)]
+    pairs = [(0, k, 1, (0.0, 0.0, 1.0)) for k in range(1, 12)]
+    rows = [np.zeros((0, 14))]
+    contacts = Contacts.of([pairs], rows, names, batched=False)
+    assert lines(contacts).startswith("Contacts(('body 0', 'body 1'): 1, ('body 0', 'body 2'): 1")
+    assert lines(contacts).endswith("and 3 more pairs)")

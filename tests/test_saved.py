@@ -12,7 +12,7 @@ import torch
 from processes import run_python
 
 import diffcloth_torch as dc
-from diffcloth_torch import saved
+from diffcloth_torch import saved, saved_0_1
 
 SAVED = Path(__file__).parent / "data" / "saved_0_1"  # by save_records.py there
 KINDS = "['ContactPoints', 'Control', 'Parameters', 'State']\n"
@@ -62,7 +62,7 @@ def test_the_table_has_the_module_of_each_saved_class():
     for name, module in saved._MODULES.items():
         cls = getattr(importlib.import_module(f"diffcloth_torch.{module}"), name)
         assert (cls.__module__, cls.__name__) == (f"diffcloth_torch.{module}", name)
-    for module, names in saved._MODULES_0_1.items():
+    for module, names in saved_0_1.MODULES.items():
         there = importlib.import_module(f"diffcloth_torch.{module}")
         assert all(getattr(there, name) is saved._class(name) for name in names)
 

@@ -16,6 +16,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from diffcloth_torch.checkpoint import read_checkpoint, refusing_damage, write_checkpoint
+from diffcloth_torch.cli import results_0_1
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import PART, as_path, read_regular_file, replace_file
 from diffcloth_torch.lock import LOCK, locked
@@ -32,6 +33,7 @@ __all__ = [
     "read_actions",
     "read_resume",
     "results_folder",
+    "resume_file",
     "resumed_folder",
     "step_records",
     "values_used",
@@ -49,7 +51,6 @@ _FILES = (
 )
 _FOLDERS = ("meshes", "animation_frames", "evaluation_frames", "evaluations", "events")
 
-_RESUME_BEFORE = "resume.json"  # name before 0.2.0
 _LARGEST_ACTIONS = 256 << 20  # bytes of a file: no run of this code writes a tenth
 
 
@@ -120,7 +121,7 @@ def _check_places(folder: Path) -> None:
 
 def clear(folder: Path) -> None:
     """Remove the files of earlier results."""
-    for name in (*_FILES, _RESUME_BEFORE):
+    for name in (*_FILES, results_0_1.RESUME):
         (folder / name).unlink(missing_ok=True)
 
 
@@ -192,22 +193,29 @@ def read_resume(folder: Path, command: str) -> dict[str, Any]:
     Raises:
         InvalidInput: If there is no such file, or its content is damaged.
     """
-    file = folder / RESUME
-    if not file.is_file():
-        older = (folder / _RESUME_BEFORE).is_file()
-        why = (
-            f"; {_RESUME_BEFORE} is of diffcloth_torch before 0.2.0, which cannot be resumed"
-            if older
-            else ""
-        )
-        raise InvalidInput(
-            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why}"
-        )
-    content = read_checkpoint("--resume", file, command)
+    file = resume_file(folder, command)
+    if file.name == RESUME:
+        content = read_checkpoint("--resume", file, command)
+    else:
+        content = results_0_1.read_results(folder, command)
     with refusing_damage("--resume", file):
         if not isinstance(content, dict) or not isinstance(content.get("config"), dict):
             raise InvalidInput("its content must be a dict with a configuration")
         return {**content, "source": as_path("the source", content["source"])}
+
+
+def resume_file(folder: Path, command: str) -> Path:
+    """The file that a command goes on from, of 0.1 where there is no other.
+
+    Raises:
+        InvalidInput: If there is none.
+    """
+    for file in (folder / RESUME, folder / results_0_1.RESUME):
+        if file.is_file():
+            return file
+    raise InvalidInput(
+        f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {folder / RESUME}"
+    )
 
 
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
@@ -241,7 +249,7 @@ def values_used(task: ConfiguredTask) -> dict[str, Any]:
     parameters except the rest positions, which equal the mesh.
     """
     simulator = task.simulator
-    parameters = simulator.parameters()
+    parameters = simulator.default_parameters()
     values = {name: getattr(parameters, name) for name in PARAMETERS if name != "rest_positions"}
     given = {name: value.tolist() for name, value in values.items() if value is not None}
     chosen = {name: given.get(name) for name in ("barrier_distance", "barrier_stiffness")}

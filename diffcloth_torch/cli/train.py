@@ -16,11 +16,11 @@ from tqdm import tqdm
 from diffcloth_torch import envs
 from diffcloth_torch.checkpoint import check_like, refusing_damage
 from diffcloth_torch.cli.results import (
-    RESUME,
     check_folder,
     clear,
     read_resume,
     results_folder,
+    resume_file,
     resumed_folder,
     write_metrics,
     write_resume,
@@ -30,7 +30,7 @@ from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, Work
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn.evaluation import evaluate, follow
-from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.options import TrainerOptions, name_now
 from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
 from diffcloth_torch.learn.trainer import Trainer, record_of, restore
@@ -101,7 +101,7 @@ def resume_training(folder: Path) -> str:
 
 def _resumed(folder: Path, kept: dict[str, Any], workers: _Workers) -> str:
     job = _Job(_check(kept["config"], kept["source"]), kept["source"], workers)
-    with refusing_damage("--resume", folder / RESUME):
+    with refusing_damage("--resume", resume_file(folder, "train")):
         evaluations = job.restore(kept)
     return job.run(folder, evaluations)
 
@@ -438,6 +438,8 @@ def _named(where: str, options: type[TrainerOptions], given: dict[str, Any]) -> 
     accepted = [field.name for field in fields(options)]
     for name in given:
         if name not in accepted:
-            raise InvalidInput(f"{where} may have {', '.join(accepted)}; got {name!r}")
+            raise InvalidInput(
+                f"{where} may have {', '.join(accepted)}; got {name!r}{name_now(name)}"
+            )
     values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
     return options(**values)

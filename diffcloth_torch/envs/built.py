@@ -10,7 +10,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch.checks import ArrayLike, check_choice, check_count
 from diffcloth_torch.envs.actuators import Actuator
 from diffcloth_torch.envs.env import Task
 from diffcloth_torch.envs.randomization import Ranges
@@ -122,7 +122,7 @@ def with_material(cloth: Cloth, material: Material | None) -> Cloth:
     """The cloth with another material, if there is one."""
     if material is None:
         return cloth
-    pins: Mapping[str, object] = dict(cloth.pins)
+    pins: Mapping[str, ArrayLike] = dict(cloth.pins)
     return Cloth(
         cloth.vertices,
         cloth.faces,

@@ -23,6 +23,7 @@ from diffcloth_torch.envs.randomization import Randomization, Ranges
 from diffcloth_torch.envs.safety import SafetyStop
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.operations import operation
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State, where
 from diffcloth_torch.sim.simulator import Simulator
@@ -55,6 +56,8 @@ class EnvState:
     failed: Tensor
     blocked: Tensor
     held: Tensor
+
+    __repr__ = dataclass_text
 
     def __len__(self) -> int:
         return len(self.elapsed)

@@ -67,7 +67,7 @@ class Randomization:
         if not given:
             return
         scene = simulator.scene
-        defaults = simulator.parameters()
+        defaults = simulator.default_parameters()
         self._cloths, self._surfaces = len(scene.cloths), len(simulator.surfaces)
         dynamic = [body.motion == "dynamic" for body in scene.bodies]
         self._dynamic = cpu.tensor(dynamic, dtype=torch.bool)

@@ -30,7 +30,7 @@ __all__ = ["Teacher", "imitate"]
 Teacher = Callable[[Tensor, ClothVectorEnv], Tensor]
 """A function of observations [B, O] and environments that returns actions [B, A]."""
 
-_OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), deviation=0.05)
+_OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), init_std=0.05)
 _NOISE = 0.1  # standard deviation of the noise on the actions of a teacher that drives
 _NOISY = 0.5  # share of them that have noise
 _RATE = 3e-3  # of Adam at first; it falls to 0 along a cosine
@@ -67,7 +67,7 @@ def imitate(
         episodes: Number of episodes of a round.
         seed: Seed of the starts, of the noise, of the networks and of the fit.
         iterations: Steps of Adam after each round.
-        options: Its `hidden`, `plan_knots`, `deviation` and `first_action` shape the policy, so
+        options: Its `hidden`, `plan_knots`, `init_std` and `first_action` shape the policy, so
             that a trainer with the same ones can go on. None takes (128, 128), 12 and .05.
 
     Returns:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.reprs import dataclass_text
+from diffcloth_torch.saved_0_1 import OPTIONS
 
-__all__ = ["ALGORITHMS", "SCALES", "TrainerOptions"]
+__all__ = ["ALGORITHMS", "SCALES", "TrainerOptions", "name_now"]
 
 ALGORITHMS = ("apg", "shac", "sapo")
 SCALES = ("number", "tensor")
@@ -17,13 +20,34 @@ _LEAST_SHARE = 0.1
 _LARGEST_COUNT = 10**6  # of what each update repeats
 _LARGEST = 1e6  # above every sensible rate
 _POSITIVE = (
-    "actor_rate", "plan_rate", "critic_rate", "gradient_norm", "deviation", "temperature",
-    "temperature_rate",
+    "learning_rate", "plan_learning_rate", "critic_learning_rate", "temperature_learning_rate",
+    "max_grad_norm", "init_std", "temperature",
 )  # fmt: skip
 
 
+def name_now(name: str) -> str:
+    """Text that follows the message of an unknown option: its name since 0.2.0, if it has one."""
+    return f"; since 0.2.0 its name is `{OPTIONS[name]}`" if name in OPTIONS else ""
+
+
+class _RefusesOldNames:
+    """Refuses names that options had in 0.1, and reports the names of today."""
+
+    def __new__(cls, *_: object, **options: object) -> _RefusesOldNames:
+        for name in options:
+            if name in OPTIONS:
+                raise TypeError(f"TrainerOptions: `{name}` is no option{name_now(name)}")
+        return super().__new__(cls)
+
+    if not TYPE_CHECKING:  # type checkers know the fields
+
+        def __getattr__(self, name: str) -> Any:
+            kind = type(self).__name__
+            raise AttributeError(f"{kind!r} object has no attribute {name!r}{name_now(name)}")
+
+
 @dataclass(frozen=True)
-class TrainerOptions:
+class TrainerOptions(_RefusesOldNames):
     """How a policy is learned.
 
     Attributes:
@@ -35,11 +59,11 @@ class TrainerOptions:
             differentiated as that of a plan: where a plan cannot be improved the policy cannot
             either, and what a policy sees does not multiply gradients step by step.
         discount: Of rewards from step to step, gamma.
-        trace: Of lambda returns, lambda.
-        actor_rate: Learning rate of Adam for the policy.
-        critic_rate: The same for the critic.
-        decay_updates: Number of updates over which these and `plan_rate` fall, linearly, to a
-            tenth; 0 for never.
+        gae_lambda: Of lambda returns, lambda.
+        learning_rate: Learning rate of Adam for the policy.
+        critic_learning_rate: The same for the critic.
+        decay_updates: Number of updates over which these and `plan_learning_rate` fall, linearly,
+            to a tenth; 0 for never.
         scale: What Adam divides the steps of the policy by. "number": a scale for each number, as
             usual, so that all of them move equally fast. "tensor": one scale for all numbers of a
             tensor, such as the knots of a plan, so that what counts little moves little.
@@ -47,20 +71,22 @@ class TrainerOptions:
         critic_epochs: How often the critic sees each rollout.
         critic_batches: Parts of a rollout between two steps of the critic.
         critic_only: Updates at first that improve the critic alone.
-        target_rate: Share by which the target critic moves after each rollout.
-        gradient_norm: Largest norm of a gradient of the policy; longer ones are shortened.
-        deviation: Of the noise of actions at first.
+        tau: Polyak rate: share by which the target critic moves towards the critic after each
+            rollout.
+        max_grad_norm: Largest norm of a gradient of the policy; longer ones are shortened.
+        init_std: Standard deviation of the noise of actions at first.
         critics: Number of critics of "sapo": their mean is the value that a policy climbs, their
             least one the value that they learn.
         temperature: Of "sapo" at first: what a unit of entropy is worth, in units of reward.
-        temperature_rate: Learning rate of Adam for its logarithm.
+        temperature_learning_rate: Learning rate of Adam for its logarithm.
         target_entropy: Mean entropy, per number of an action, that the temperature aims at.
         first_action: Action of the policy at first, between -1 and 1; None for zeros.
         plan_knots: Number of actions, at even times of an episode and with lines between them, that
             are learned as a plan. A policy is then the sum of that plan, of a linear function of
             what it sees, and of its network. The task must observe its "time". 0 for the network
             alone.
-        plan_rate: Learning rate of Adam for the plan; the linear function has that of the policy.
+        plan_learning_rate: Learning rate of Adam for the plan; the linear function has the rate of
+            the policy.
         hidden: Sizes of hidden layers.
         max_change: Largest change of actions by an update: root mean square, without noise, over
             the observations of the rollout. A larger update is scaled back, and the scale of
@@ -81,30 +107,32 @@ class TrainerOptions:
     horizon: int = 16
     feedback: bool = False
     discount: float = 0.99
-    trace: float = 0.95
-    actor_rate: float = 2e-3
-    critic_rate: float = 2e-3
+    gae_lambda: float = 0.95
+    learning_rate: float = 2e-3
+    critic_learning_rate: float = 2e-3
     decay_updates: int = 0
     scale: str = "number"
     betas: tuple[float, float] = (0.7, 0.95)
     critic_epochs: int = 16
     critic_batches: int = 4
     critic_only: int = 0
-    target_rate: float = 0.2
-    gradient_norm: float = 1.0
-    deviation: float = 0.1
+    tau: float = 0.2
+    max_grad_norm: float = 1.0
+    init_std: float = 0.1
     critics: int = 2
     temperature: float = 1e-3
-    temperature_rate: float = 2e-2
+    temperature_learning_rate: float = 2e-2
     target_entropy: float = -1.0
     first_action: tuple[float, ...] | None = None
     plan_knots: int = 0
-    plan_rate: float = 4e-2
+    plan_learning_rate: float = 4e-2
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
     max_change: float | None = None
     held_out: int | None = None
     check_every: int = 10
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
@@ -115,7 +143,7 @@ class TrainerOptions:
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1, _LARGEST_COUNT)
         for name in ("critic_only", "decay_updates", "plan_knots", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
-        for name in ("discount", "trace", "target_rate"):
+        for name in ("discount", "gae_lambda", "tau"):
             _check_number(name, getattr(self, name), lambda v: 0 <= v <= 1, "in [0, 1]")
         accepted = f"positive and below {_LARGEST:g}"
         for name in _POSITIVE:

@@ -129,7 +129,7 @@ class Policy(torch.nn.Module):
             sizes.observations,
             cpu.tensor(first or [0.0] * sizes.actions, dtype=torch.float32),
             options.hidden,
-            options.deviation,
+            options.init_std,
             sees_width=options.has_entropy,
             knots=options.plan_knots,
         )

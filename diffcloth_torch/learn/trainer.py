@@ -140,19 +140,19 @@ class Trainer:
             self.policy = Policy(self._env, o)
         if init is not None:
             begin_at("Trainer: `init`", self.policy, init)
-        self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
+        self._places = self._begin_all()
         plan = self.policy.actor.plan
         knots = [] if plan is None else [plan.knots]
         others = [p for p in self.policy.actor.parameters() if all(p is not k for k in knots)]
-        groups = [{"params": others, "lr": o.actor_rate}]
-        groups += [{"params": knots, "lr": o.plan_rate}] if knots else []
+        groups = [{"params": others, "lr": o.learning_rate}]
+        groups += [{"params": knots, "lr": o.plan_learning_rate}] if knots else []
         adam = TensorAdam if o.scale == "tensor" else torch.optim.Adam
         self._actor_steps = adam(groups, betas=o.betas)
         self._critic_steps = torch.optim.Adam(
-            self.policy.critics.parameters(), lr=o.critic_rate, betas=o.betas
+            self.policy.critics.parameters(), lr=o.critic_learning_rate, betas=o.betas
         )
         self._temperature_steps = torch.optim.Adam(
-            [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
+            [self.policy.log_temperature], lr=o.temperature_learning_rate, betas=o.betas
         )
         self.steps = self.updates = self.undone = 0
         starts = episode_seeds(purpose_seed(o.seed, "undo"), o.held_out or 0)
@@ -197,10 +197,10 @@ class Trainer:
 
     def _update(self) -> dict[str, float]:
         o, share = self.options, self.options.rate_share(self.updates)
-        rates = o.actor_rate, o.plan_rate
+        rates = o.learning_rate, o.plan_learning_rate
         for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
             group["lr"] = share * rate
-        self._critic_steps.param_groups[0]["lr"] = share * o.critic_rate
+        self._critic_steps.param_groups[0]["lr"] = share * o.critic_learning_rate
         if self.held_out and self._kept is None:
             self.check()
         rollouts = self._rollouts()
@@ -299,13 +299,16 @@ class Trainer:
             given = {"undone": 0, "kept": None} | dict(given)
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
-        if given["task"] != own["task"]:
-            raise InvalidInput(f"{owner} is of {given['task']}, not of {own['task']}")
+        _require_task(owner, given["task"], own["task"])
+        # An earlier version did not have the other options.
         if not isinstance(given["options"], dict) or (
             asdict(TrainerOptions()) | given["options"] != own["options"]
         ):
             raise InvalidInput(f"{owner} was written with other options")
-        places = self._checked_places(owner, given["places"])
+        if given["places"] is None:  # a file of 0.1
+            places = self._begin_all()
+        else:
+            places = self._checked_places(owner, given["places"])
         check_like(f"{owner}['counts']", given["counts"], own["counts"])
         steps, updates = given["counts"]
         if steps != updates * self.options.horizon * self._count:
@@ -377,6 +380,8 @@ class Trainer:
     def load(self, path: str | Path) -> None:
         """Go on with the content of a file of `save`, to the same bits.
 
+        With a file of 0.1, which keeps no environments, all episodes begin anew.
+
         Raises:
             InvalidInput: If it is no such file, is damaged, or is of another task, of other
                 options, or of environments in other chunks. The trainer is then as before.
@@ -397,7 +402,7 @@ class Trainer:
             "name": task.name,
             "actions": task.action_size,
             "observations": sizes,
-            "frame": task.frame,
+            "frame": task.frame if "frame_axes" in task.example().drawn else "world",
             "horizon": task.horizon,
             "substeps": task.substeps,
             "vertices": len(task.simulator.initial_state().positions),
@@ -410,6 +415,9 @@ class Trainer:
     @property
     def _chunks(self) -> range:
         return range(0, self._count, self._chunk)
+
+    def _begin_all(self) -> list[tuple[EnvState, list[Tensor]]]:
+        return [self._begin(range(k, k + self._chunk)) for k in self._chunks]
 
     def _begin(self, numbers: Sequence[int]) -> tuple[EnvState, list[Tensor]]:
         """Environments by their numbers, each of which has a seed of its own."""
@@ -459,7 +467,7 @@ class Trainer:
                 gradient += rollout.gradients[k]
             parameter.grad = gradient
         parameters = list(self.policy.actor.parameters())
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.gradient_norm)
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.max_grad_norm)
         if not bool(torch.isfinite(norm)):
             raise SimulationError(
                 f"Trainer.update: the gradient of update {self.updates} is not finite; a square "
@@ -476,7 +484,7 @@ class Trainer:
             # The least opinion: what one critic alone overestimates a policy would climb.
             values = policy.targets(policy.scale(rows.after)).amin(dim=0)
             rewards = rows.rewards + policy.temperature * rows.entropies
-            goals = _lambda_returns(rows, rewards, values, o.discount, o.trace).flatten()
+            goals = _lambda_returns(rows, rewards, values, o.discount, o.gae_lambda).flatten()
             seen = policy.scale(rows.seen).flatten(0, 1)
         losses = []
         for _ in range(o.critic_epochs):
@@ -491,7 +499,7 @@ class Trainer:
         with torch.no_grad():
             pairs = zip(policy.targets.parameters(), policy.critics.parameters(), strict=True)
             for slow, fast in pairs:
-                slow.lerp_(fast, o.target_rate)
+                slow.lerp_(fast, o.tau)
         return sum(losses) / len(losses)
 
     def _step_temperature(self, entropy: float) -> None:
@@ -532,6 +540,25 @@ def restore(trainer: Trainer, record: Any) -> None:
             return. The trainer is then as before.
     """
     trainer._load("the trainer", record)
+
+
+def _require_task(owner: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Require the description of a task of which a policy can go on."""
+    if given == own:
+        return
+    if not {"name", "frame", "observations"} <= given.keys() or given["name"] != own["name"]:
+        raise InvalidInput(f"{owner} is of {given}, not of {own}")
+    if given["observations"] != own["observations"]:
+        raise InvalidInput(
+            f"{owner} has learned from other observations of {own['name']}: "
+            f"{given['observations']}, which are {own['observations']} now; it must learn anew"
+        )
+    if given["frame"] != own["frame"]:
+        raise InvalidInput(
+            f"{owner} has learned from observations of {own['name']} in the axes of the "
+            f"{given['frame']}: make the task with frame={given['frame']!r}"
+        )
+    raise InvalidInput(f"{owner} is of {given}, not of {own}")
 
 
 class _Rows:

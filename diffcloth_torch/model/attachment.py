@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
     UNIT_INTERVAL,
+    ArrayLike,
     FloatArray,
     Range,
     check_finite,
@@ -79,8 +80,8 @@ class Attachment:
         a: Sequence[Any],
         b: Sequence[Any] | None = None,
         *,
-        stiffness: object,
-        rest_length: object = 0.0,
+        stiffness: ArrayLike,
+        rest_length: ArrayLike = 0.0,
         name: str | None = None,
     ) -> None:
         """Check the arguments.

@@ -11,6 +11,7 @@ import numpy as np
 
 from diffcloth_torch.checks import (
     POSITIVE,
+    ArrayLike,
     FloatArray,
     IndexArray,
     check_choice,
@@ -77,18 +78,18 @@ class Cloth:
 
     def __init__(
         self,
-        vertices: object,
-        faces: object,
+        vertices: ArrayLike,
+        faces: ArrayLike,
         *,
         material: Material = _DEFAULT_MATERIAL,
-        pins: Mapping[str, object] | None = None,
-        soft_pins: Mapping[str, object] | None = None,
+        pins: Mapping[str, ArrayLike] | None = None,
+        soft_pins: Mapping[str, ArrayLike] | None = None,
         pin_stiffness: float = 1e4,
-        rest_positions: object = None,
+        rest_positions: ArrayLike | None = None,
         bending_model: str = "patch",
         name: str | None = None,
-        directions: object = None,
-        pose: object = None,
+        directions: ArrayLike | None = None,
+        pose: ArrayLike | None = None,
     ) -> None:
         """Check and copy the arguments.
 
@@ -201,11 +202,11 @@ class Cloth:
 
     @overload
     @classmethod
-    def grid(cls, counts: Sequence[int], size: object = 1.0, **keywords: Any) -> Cloth: ...
+    def grid(cls, counts: Sequence[int], size: ArrayLike = 1.0, **keywords: Any) -> Cloth: ...
 
     @overload
     @classmethod
-    def grid(cls, rows: int, columns: int, size: object = 1.0, **keywords: Any) -> Cloth: ...
+    def grid(cls, rows: int, columns: int, size: ArrayLike = 1.0, **keywords: Any) -> Cloth: ...
 
     @classmethod
     def grid(cls, *arguments: Any, **keywords: Any) -> Cloth:
@@ -348,7 +349,9 @@ def _refuse_woven_hinges(material: Material) -> None:
 
 
 def _pin_groups(
-    pins: Mapping[str, object] | None, soft_pins: Mapping[str, object] | None, vertex_count: int
+    pins: Mapping[str, ArrayLike] | None,
+    soft_pins: Mapping[str, ArrayLike] | None,
+    vertex_count: int,
 ) -> tuple[Mapping[str, IndexArray], Mapping[str, IndexArray]]:
     """Check both kinds together: no vertex may be pinned twice."""
     groups = []

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ _DEFAULT_SUBDIVISIONS = 3  # of a sphere, as for `RigidBody.sphere`
 
 _DETACHED = "pass a detached tensor"
 
+T = TypeVar("T")
+
 
 class RoundLinks(NamedTuple):
     """A robot whose links are round or have triangles, not both.
@@ -49,7 +51,7 @@ class RoundLinks(NamedTuple):
     skeletons: Mapping[str, ContactSurface]
     parts: Mapping[str, tuple[str, ...]]
 
-    def with_parts(self, of_links: object) -> object:
+    def with_parts(self, of_links: T) -> T | dict[str, Any]:
         """Give what a mapping says of a link to its parts, too, unless it names these."""
         if not isinstance(of_links, Mapping):
             return of_links

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.checks import ArrayLike, FloatArray
 from diffcloth_torch.geometry.loaded import load_mesh
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
@@ -37,12 +37,12 @@ class DeformingBody(Cloth):
 
     def __init__(
         self,
-        vertices: object,
-        faces: object,
+        vertices: ArrayLike,
+        faces: ArrayLike,
         *,
         friction: float = 0.4,
         thickness: float = 0.0,
-        pose: object = None,
+        pose: ArrayLike | None = None,
         name: str | None = None,
     ) -> None:
         """Check and copy the arguments.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
 from diffcloth_torch.model.quantities import check_parameter
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.saved import saved
 
 __all__ = [
@@ -54,6 +55,8 @@ class ContactOptions:
     friction_iterations: int = 2
     slip_velocity: float = 1e-5
     self_contact: bool = True
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         for field in ("barrier_distance", "barrier_stiffness", "slip_velocity"):
@@ -115,6 +118,8 @@ class SolverOptions:
     elastic: str = "newton"
     max_seconds: float | None = None
     certify: str = "always"
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         tolerance = check_number("SolverOptions: `tolerance`", self.tolerance, POSITIVE)

@@ -11,6 +11,7 @@ import numpy as np
 
 from diffcloth_torch.checks import (
     POSITIVE,
+    ArrayLike,
     FloatArray,
     IndexArray,
     check_bool,
@@ -103,17 +104,17 @@ class RigidBody:
 
     def __init__(
         self,
-        vertices: object,
-        faces: object,
+        vertices: ArrayLike,
+        faces: ArrayLike,
         *,
         motion: str = "static",
-        pose: object = None,
+        pose: ArrayLike | None = None,
         friction: float = 0.4,
         thickness: float = 0.0,
         density: float | None = None,
         mass: float | None = None,
-        center: object = None,
-        inertia: object = None,
+        center: ArrayLike | None = None,
+        inertia: ArrayLike | None = None,
         nodal_contact: bool = False,
         name: str | None = None,
     ) -> None:
@@ -179,7 +180,7 @@ class RigidBody:
     def _of(
         cls,
         primitive: Primitive,
-        mesh: tuple[object, object],
+        mesh: tuple[ArrayLike, ArrayLike],
         *,
         smooth: bool = False,
         nodal_contact: bool = False,
@@ -299,7 +300,7 @@ class RigidBody:
         return cls(mesh.vertices, mesh.faces, **keywords)
 
     @classmethod
-    def box(cls, size: object, **keywords: Any) -> RigidBody:
+    def box(cls, size: ArrayLike, **keywords: Any) -> RigidBody:
         """Make a cuboid centered at the origin.
 
         Args:
@@ -377,7 +378,7 @@ class RigidBody:
         return cls(*shapes.cylinder(r, h, rings), **keywords)
 
     @classmethod
-    def plane(cls, size: object, **keywords: Any) -> RigidBody:
+    def plane(cls, size: ArrayLike, **keywords: Any) -> RigidBody:
         """Make a rectangle of two triangles at z = 0 that faces up, centered at the origin.
 
         In contact at nodes the plane is infinite, and everything below it is inside.

@@ -15,6 +15,7 @@ from diffcloth_torch.checks import (
     ANY_NUMBER,
     NON_NEGATIVE,
     POSITIVE,
+    ArrayLike,
     FloatArray,
     Range,
     check_choice,
@@ -49,6 +50,12 @@ from diffcloth_torch.model.urdf import describe_urdf
 from diffcloth_torch.saved import saved
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
+
+Actuation = str | Mapping[str, str | None] | Sequence[str | None] | None
+"""One mode for all joints, name of a joint -> its mode, or a list of modes."""
+
+ByName = ArrayLike | Mapping[str, float]
+"""One number for all joints or links, an array of numbers, or name -> number."""
 
 BASES = ("fixed", "kinematic", "floating")
 ACTUATIONS = ("position", "velocity", "torque", "pd")
@@ -115,18 +122,18 @@ class Robot:
         *,
         mesh_root: str | Path | None = None,
         base: str = "fixed",
-        pose: object = None,
-        joint_positions: object = None,
-        actuation: object = None,
-        stiffness: object = None,
-        damping: object = None,
-        effort_limits: object = None,
-        velocity_limits: object = None,
-        joint_friction: object = None,
-        friction: object = 0.4,
-        thickness: object = 0.0,
+        pose: ArrayLike | None = None,
+        joint_positions: ByName | None = None,
+        actuation: Actuation = None,
+        stiffness: ByName | None = None,
+        damping: ByName | None = None,
+        effort_limits: ByName | None = None,
+        velocity_limits: ByName | None = None,
+        joint_friction: ByName | None = None,
+        friction: ByName = 0.4,
+        thickness: ByName = 0.0,
         edge_length: float | None = None,
-        smooth: object = False,
+        smooth: bool | Mapping[str, bool] = False,
         ignore_contact: Iterable[Sequence[str]] | str = (),
         name: str | None = None,
     ) -> Robot:
@@ -232,7 +239,7 @@ class Robot:
         inertials: Mapping[str, Sequence[Any]] | None = None,
         limits: Mapping[str, Sequence[float]] | None = None,
         base: str = "fixed",
-        actuation: object = None,
+        actuation: Actuation = None,
         **options: Any,
     ) -> Robot:
         """Take a chain of pytorch-kinematics, and what it does not carry.
@@ -288,15 +295,15 @@ class Robot:
         bounds: JointBounds,
         *,
         skeletons: Mapping[str, ContactSurface] | None = None,
-        pose: object = None,
-        joint_positions: object = None,
-        stiffness: object = None,
-        damping: object = None,
-        effort_limits: object = None,
-        velocity_limits: object = None,
-        joint_friction: object = None,
-        friction: object = 0.4,
-        thickness: object = 0.0,
+        pose: ArrayLike | None = None,
+        joint_positions: ByName | None = None,
+        stiffness: ByName | None = None,
+        damping: ByName | None = None,
+        effort_limits: ByName | None = None,
+        velocity_limits: ByName | None = None,
+        joint_friction: ByName | None = None,
+        friction: ByName = 0.4,
+        thickness: ByName = 0.0,
         ignore_contact: Iterable[Sequence[str]] | str = (),
         name: str | None = None,
     ) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 from diffcloth_torch.checks import (
+    ArrayLike,
     FloatArray,
     check_finite,
     check_ignored_pairs,
@@ -72,7 +73,7 @@ class Scene:
         bodies: Iterable[RigidBody | DeformingBody] = (),
         robots: Iterable[Robot] = (),
         *,
-        gravity: object = (0.0, 0.0, -9.81),
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
         air_density: float = _AIR_DENSITY,
         ignore_contact: Iterable[Sequence[str]] | str = (),
         attachments: Iterable[Attachment] = (),

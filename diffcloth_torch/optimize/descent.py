@@ -32,6 +32,7 @@ from diffcloth_torch.optimize.evaluation import (
 )
 from diffcloth_torch.optimize.progress import Progress
 from diffcloth_torch.optimize.rows import Rows
+from diffcloth_torch.reprs import dataclass_text
 
 __all__ = ["Descent", "Optimizers", "TrialError", "descend"]
 
@@ -71,6 +72,8 @@ class Descent:
     random_state: Tensor
     best_rows: dict[str, Tensor]
     best_losses: Tensor
+
+    __repr__ = dataclass_text
 
     def record(self) -> dict[str, Any]:
         """Return all fields in types that `torch.load` reads with `weights_only`."""

@@ -20,6 +20,7 @@ from diffcloth_torch.errors import (
 )
 from diffcloth_torch.operations import operation
 from diffcloth_torch.optimize.statistics import rollout_statistics
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.sim.records.state import State, check_state
 
 __all__ = [
@@ -76,6 +77,8 @@ class Evaluation:
     forward_seconds: float
     backward_seconds: float
     environment_losses: list[float | None]
+
+    __repr__ = dataclass_text
 
     @property
     def failed_environments(self) -> list[int]:

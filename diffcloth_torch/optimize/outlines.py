@@ -12,6 +12,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
+    ArrayLike,
     FloatArray,
     check_bool,
     check_count,
@@ -41,10 +42,10 @@ _PER_WAVE = 4  # directions, at least, for each wave that tells how an outline i
 
 def outline(
     states: Sequence[State],
-    outlines: Sequence[object],
-    faces: object,
+    outlines: Sequence[ArrayLike],
+    faces: ArrayLike,
     *,
-    center: object = (0.0, 0.0),
+    center: ArrayLike = (0.0, 0.0),
     directions: int = 72,
     noise: float = 1.0,
     turned: bool = False,

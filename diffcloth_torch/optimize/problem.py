@@ -28,6 +28,7 @@ from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.compared import blocks_of, noting
 from diffcloth_torch.optimize.series import Layout, layout_of
 from diffcloth_torch.optimize.variables import Space
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = [
@@ -78,6 +79,8 @@ class Trial:
     values: dict[str, Tensor]
     seconds: float
     failure: str = ""
+
+    __repr__ = dataclass_text
 
 
 class Memory:

@@ -13,6 +13,7 @@ from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
     POSITIVE,
+    ArrayLike,
     FloatArray,
     check_finite,
     check_range,
@@ -41,12 +42,12 @@ __all__ = ["extrapolated", "markers", "outline", "point_cloud"]
 
 def markers(
     states: Sequence[State],
-    observed: object,
-    weights: object = None,
+    observed: ArrayLike,
+    weights: ArrayLike | None = None,
     *,
-    vertices: object = None,
-    noise: object = 1.0,
-    times: object = None,
+    vertices: ArrayLike | None = None,
+    noise: ArrayLike = 1.0,
+    times: ArrayLike | None = None,
     delay: Tensor | float = 0.0,
     frame: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
@@ -128,7 +129,7 @@ def markers(
 
 
 def _seen_positions(
-    owner: str, states: Sequence[State], times: object, delay: Tensor | float
+    owner: str, states: Sequence[State], times: ArrayLike | None, delay: Tensor | float
 ) -> tuple[Tensor, FloatArray]:
     """Positions [T, N, 3] at the moments of a camera, and these moments [s]."""
     positions = positions_of(owner, states)
@@ -165,7 +166,7 @@ def _in_frame(owner: str, positions: Tensor, frame: tuple[Tensor, Tensor]) -> Te
     return positions @ turn.T + translation
 
 
-def _noise_of_coordinates(owner: str, noise: object, shape: tuple[int, ...]) -> FloatArray:
+def _noise_of_coordinates(owner: str, noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Standard deviation of each coordinate [m]."""
     given = float_array(f"{owner}: `noise`", noise)
     frames, count, _ = shape
@@ -175,7 +176,9 @@ def _noise_of_coordinates(owner: str, noise: object, shape: tuple[int, ...]) -> 
     return np.broadcast_to(given, shape).copy()
 
 
-def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: float = 1.0) -> Tensor:
+def point_cloud(
+    states: Sequence[State], clouds: Sequence[ArrayLike], *, noise: float = 1.0
+) -> Tensor:
     """Each observed point less the vertex of the cloths that is nearest to it, over the noise.
 
     One-sided, from what was seen to what is simulated: parts that no camera saw do not count. Which

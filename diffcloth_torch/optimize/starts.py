@@ -22,6 +22,7 @@ from diffcloth_torch.optimize.problem import FAILURES, Failure, Memory, Problem,
 from diffcloth_torch.optimize.series import Layout
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.processes import Pool
+from diffcloth_torch.reprs import dataclass_text
 from diffcloth_torch.worker import note_progress
 
 __all__ = ["End", "Job", "Stage", "Start", "judge", "run", "run_all"]
@@ -64,6 +65,8 @@ class Start:
     success: bool
     message: str
     apart: str
+
+    __repr__ = dataclass_text
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from torch import Tensor
 from diffcloth_torch.checks import (
     ANY_NUMBER,
     POSITIVE,
+    ArrayLike,
     FloatArray,
     Range,
     check_bool,
@@ -27,6 +28,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.reprs import dataclass_text
 
 __all__ = ["Prior", "Space", "Tie", "Values", "Variable"]
 
@@ -58,12 +60,14 @@ class Variable:
             nothing but the bounds.
     """
 
-    value: object
+    value: ArrayLike
     bounds: tuple[float, float] | None = None
     scale: Literal["log", "linear"] | None = None
     free: bool = True
     spread: float = 3.0
-    prior: tuple[object, object] | None = None
+    prior: tuple[ArrayLike, ArrayLike] | None = None
+
+    __repr__ = dataclass_text
 
     def __post_init__(self) -> None:
         numbers = float_array("Variable: `value`", self.value).copy()

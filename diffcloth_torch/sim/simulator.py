@@ -10,6 +10,7 @@ import torch
 
 from diffcloth_torch.autograd.guards import guarded, uncompiled
 from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch.errors import warn_caller
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import has_barrier, has_contact, scene_parameters
 from diffcloth_torch.model.options import (
@@ -297,10 +298,23 @@ class Simulator(Observables):
         return check_control(self._layout, control)
 
     @guarded
-    def parameters(self) -> Parameters:
-        """Copy the parameters of the scene to new tensors; change them with `.replace(...)`."""
+    def default_parameters(self) -> Parameters:
+        """Copy the parameters of the scene to new tensors; change them with `.replace(...)`.
+
+        They are no iterator, as `torch.nn.Module.parameters()` is: optimizers take tensors, such as
+        `[leaf]` of `default_parameters().replace(stretch=leaf)`.
+        """
         copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
         return Parameters(**copies, _unbatched=tuple(copies))
+
+    def parameters(self) -> Parameters:
+        """Return `default_parameters()`: an alias, the name in 0.1, which warns."""
+        warn_caller(
+            "Simulator.parameters: its name is `default_parameters` since 0.2.0; `parameters` of "
+            "torch is an iterator for optimizers",
+            FutureWarning,
+        )
+        return self.default_parameters()
 
     @guarded
     def step(

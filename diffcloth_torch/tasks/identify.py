@@ -134,7 +134,7 @@ class _Motion:
         """The states that are observed, at values of the variables."""
         simulator, start = self.task.simulator, self.task.initial_state()
         given: dict[str, Any] = {n: v for n, v in values.items() if n in PARAMETERS}
-        parameters = simulator.parameters().replace(**given)
+        parameters = simulator.default_parameters().replace(**given)
         velocity = values.get(_VELOCITY)
         if velocity is None and self.velocity is not None:
             velocity = torch.from_numpy(self.velocity)

@@ -77,7 +77,7 @@ def parameters(sim):
 
     They have friction, drives at the edge of their limits, and are as fast as they may be.
     """
-    given = sim.parameters()
+    given = sim.default_parameters()
     heavier = _HEAVIER[sim.coupling]
     fastest = _FASTEST[sim.coupling][sim.scene.robots[0].mechanism.base]
     return given.replace(
@@ -145,7 +145,7 @@ def cloth_masses(sim):
     (cloth,) = sim.scene.cloths
     faces = torch.tensor(np.array(cloth.faces, dtype=np.int64))
     a, b, c = torch.tensor(np.array(cloth.rest_positions))[faces].unbind(1)
-    share = sim.parameters().density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
+    share = sim.default_parameters().density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
     masses = torch.zeros(len(cloth.vertices), dtype=F64)
     return masses.index_add(0, faces.flatten(), share.repeat_interleave(3))
 

@@ -171,7 +171,7 @@ def test_gradients_agree_with_differences(case, name):
     if name == "joint_terms" and name not in arrays:
         pytest.skip("no joint has a term")
     if name not in arrays:
-        arrays = {**arrays, name: scene.simulator.parameters().rest_positions.numpy()[None]}
+        arrays = {**arrays, name: scene.simulator.default_parameters().rest_positions.numpy()[None]}
         gradients = scene.gradients(arrays, cotangents)
     rng = np.random.default_rng(3)
     direction = rng.standard_normal(arrays[name].shape)

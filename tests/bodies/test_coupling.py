@@ -63,7 +63,7 @@ def test_rigid_to_cloth_moves_bodies_with_their_velocities():
     for _ in range(12):
         after = sim.step(state)
         way = (after.body_poses - state.body_poses)[0, :3]
-        free = DT * (state.body_velocities[0, :3] + DT * sim.parameters().gravity)
+        free = DT * (state.body_velocities[0, :3] + DT * sim.default_parameters().gravity)
         torch.testing.assert_close(way, free, rtol=1e-9, atol=1e-15)
         state = after
     assert state.body_velocities[0, 2] > free[2] / DT  # the impulse is in the velocity
@@ -82,8 +82,8 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
         solver=sim.solver,
     )
     # Friction alone sees the box move on.
-    same = sim.parameters().replace(friction=torch.zeros(2, 2, dtype=F64))
-    barrier = alone.parameters().replace(
+    same = sim.default_parameters().replace(friction=torch.zeros(2, 2, dtype=F64))
+    barrier = alone.default_parameters().replace(
         barrier_stiffness=same.barrier_stiffness, friction=same.friction
     )
     after = sim.step(state, None, same)
@@ -520,16 +520,16 @@ def test_gradients_through_contact_are_those_of_differences(coupling, scheme):
     cases = {
         "velocities": (start.velocities, 1e-3),
         "body_velocities": (start.body_velocities, 1e-3),
-        "body_mass": (sim.parameters().body_mass, 1e-3),
-        "stretch": (sim.parameters().stretch, 1e-1),
-        "friction": (sim.parameters().friction, 1e-3),
-        "barrier_stiffness": (sim.parameters().barrier_stiffness, 1e-1),
-        "gravity": (sim.parameters().gravity, 1e-2),
+        "body_mass": (sim.default_parameters().body_mass, 1e-3),
+        "stretch": (sim.default_parameters().stretch, 1e-1),
+        "friction": (sim.default_parameters().friction, 1e-3),
+        "barrier_stiffness": (sim.default_parameters().barrier_stiffness, 1e-1),
+        "gravity": (sim.default_parameters().gravity, 1e-2),
     }
     for name, (x, step) in cases.items():
 
         def loss(x, name=name):
-            state, parameters = start, sim.parameters()
+            state, parameters = start, sim.default_parameters()
             if hasattr(state, name):
                 state = state.replace(**{name: x})
             else:

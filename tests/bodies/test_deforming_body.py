@@ -75,7 +75,10 @@ def test_it_has_no_mass_and_no_elasticity():
     far = ball(pose=[3, 0, 0, 1, 0, 0, 0])
     simulator = dc.Simulator(dc.Scene([sheet], [far]), 0.01)
     alone = dc.Simulator(dc.Scene([sheet]), 0.01)
-    assert simulator.parameters().barrier_distance == alone.parameters().barrier_distance
+    assert (
+        simulator.default_parameters().barrier_distance
+        == alone.default_parameters().barrier_distance
+    )
     masses = simulator.vertex_masses()
     assert torch.equal(masses[:25], alone.vertex_masses())
     assert not masses[25:].any()
@@ -324,7 +327,7 @@ def test_woven_and_hinged_cloths_meet_it():
         for _ in range(2):
             state = simulator.step(state)
         assert state.report.converged
-        named = simulator.parameters().replace(stretch={"sheet": 300.0})
+        named = simulator.default_parameters().replace(stretch={"sheet": 300.0})
         simulator.step(state, None, named)
 
 

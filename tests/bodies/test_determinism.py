@@ -136,7 +136,7 @@ def test_a_robot_in_the_air_has_the_same_bits_with_any_gradient(names):
     batch = sim.initial_state(4)
     spin = torch.linspace(-2, 3, 24, dtype=torch.float64).reshape(4, 1, 6)
     batch = batch.replace(base_velocities=spin)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     leaves = {name: getattr(parameters, name).clone().requires_grad_() for name in names}
     for given in (parameters, parameters.replace(**leaves)):
         alone = [sim.step(batch[i], None, given) for i in range(4)]

@@ -20,7 +20,7 @@ def rolled(sim, state, steps, control=None):
 
 def energy(sim, state):
     """Of motion, of gravity, and of everything that cloths and contact store [J]."""
-    given = sim.parameters()
+    given = sim.default_parameters()
     parts = [part for name, part in sim.energy(state, parts=True).items() if name != "gravity"]
     masses = cloth_masses(sim)[:, None]
     parts.append((masses * (0.5 * state.velocities**2 - given.gravity * state.positions)).sum())
@@ -233,7 +233,7 @@ def test_a_tumbling_box_keeps_spin_and_energy(rate, seconds):
     turn = matrices(sim.initial_state().body_poses)[0, :3, :3]
     velocity = torch.cat([torch.tensor([0.5, -0.2, 0.1], dtype=F64), turn @ spin])[None]
     state = sim.initial_state().replace(body_velocities=velocity)
-    inertia = sim.parameters().body_inertia[0]
+    inertia = sim.default_parameters().body_inertia[0]
 
     def angular_momentum(state):
         turn = matrices(state.body_poses)[0, :3, :3]

@@ -367,7 +367,7 @@ def test_a_link_that_is_given_mass_needs_an_inertia_that_is_not_negative(tmp_pat
     robot = dc.Robot.load(path, actuation="torque")
     scene = dc.Scene([], robots=[robot])
     simulator = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     tip = list(robot.link_names).index("tip")
     mass = with_row(given.link_mass, tip, 0.2)
     for scale, is_accepted in ((0.02, True), (0.0, True), (-0.02, False)):
@@ -420,7 +420,7 @@ def test_a_link_that_is_a_point_keeps_its_parameters(tmp_path):
     path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
     scene = dc.Scene([], robots=[dc.Robot.load(path, actuation="torque")])
     simulator = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     simulator.step(simulator.initial_state(), parameters=given)
     # The base is fixed to the world: its inertia moves nothing.
     odd = given.replace(link_inertia=with_row(given.link_inertia, 0, -torch.eye(3)))

@@ -79,7 +79,7 @@ def test_a_joint_sticks_below_its_friction_but_for_the_creep_of_slip(tmp_path, s
     robot = dc.Robot.load(arm_file(tmp_path, friction=0.6), actuation="torque")
     sim = simulator(robot, gravity=(0, 0, 0))
     end = rolled(sim, 30, joint_efforts=tensor(0.6 * share))[-1]
-    rate = float(sim.parameters().joint_slip_rates)
+    rate = float(sim.default_parameters().joint_slip_rates)
     assert rate == pytest.approx(1e-5 / np.sqrt(INERTIA / MASS), rel=1e-12)
     creep = np.sign(share) * rate * (1.0 - np.sqrt(1.0 - abs(share)))
     assert float(end.joint_velocities) == pytest.approx(creep, rel=1e-5)
@@ -107,7 +107,7 @@ def test_friction_stops_a_joint(tmp_path):
     moving = slowing > 0
     np.testing.assert_allclose(np.array(speeds)[moving], slowing[moving], rtol=1e-9)
     assert moving.sum() == 3
-    rate = float(sim.parameters().joint_slip_rates)
+    rate = float(sim.default_parameters().joint_slip_rates)
     assert np.abs(np.array(speeds)[~moving]).max() < rate
 
 
@@ -143,7 +143,7 @@ def test_a_drive_that_cannot_lift_rests_where_its_limit_holds_the_weight(tmp_pat
     sim = simulator(robot)
     up = sim.control(joint_positions=tensor(-1.5), joint_efforts=tensor(feed))
     state = sim.initial_state()
-    viscous = sim.parameters().replace(joint_viscosity=tensor(0.3))
+    viscous = sim.default_parameters().replace(joint_viscosity=tensor(0.3))
     for _ in range(600):
         state = sim.step(state, up, viscous)
     q, effort = float(state.joint_positions), float(state.joint_efforts)
@@ -264,7 +264,7 @@ def test_a_joint_that_mimics_acts_on_its_leader_by_virtual_work(tmp_path):
     assert robot.effort_limits == 1 + 2 * 2
     assert robot.joint_friction == 0.2 + 2 * 0.3
     held = rolled(sim, 10, joint_efforts=tensor(0.75))[-1]
-    assert 0 < float(held.joint_velocities) < float(sim.parameters().joint_slip_rates)
+    assert 0 < float(held.joint_velocities) < float(sim.default_parameters().joint_slip_rates)
     free = simulator(
         dc.Robot.load(path, actuation="torque", joint_friction=False), gravity=(0, 0, 0)
     )
@@ -320,7 +320,7 @@ def regime_of(sim, name):
 
 
 def loss_of(sim, mode, state, inputs):
-    parameters = sim.parameters().replace(**{n: inputs[n] for n in NEW})
+    parameters = sim.default_parameters().replace(**{n: inputs[n] for n in NEW})
     names = ("joint_positions", "joint_velocities")
     state = state.replace(**{n: inputs[f"start.{n}"] for n in names})
     efforts = inputs["asked"]
@@ -404,7 +404,7 @@ def test_environments_have_limits_of_their_own_with_the_bits_that_they_have_alon
             torch.set_num_threads(threads)
             state = batch
             for _ in range(4):
-                parameters = sim.parameters().replace(**given)
+                parameters = sim.default_parameters().replace(**given)
                 state = sim.step(state, sim.control(**control), parameters)
             together.append(state)
     finally:
@@ -412,7 +412,9 @@ def test_environments_have_limits_of_their_own_with_the_bits_that_they_have_alon
     for k, (values, _) in enumerate(rows):
         alone = sim.initial_state()
         for _ in range(4):
-            alone = sim.step(alone, sim.control(**control), sim.parameters().replace(**values))
+            alone = sim.step(
+                alone, sim.control(**control), sim.default_parameters().replace(**values)
+            )
         for state in together:
             assert torch.equal(state.joint_positions[k], alone.joint_positions)
             assert torch.equal(state.joint_efforts[k], alone.joint_efforts)
@@ -427,7 +429,7 @@ def test_friction_holds_an_arm_where_the_search_begins(tmp_path):
     robot = dc.Robot.load(arm_file(tmp_path, friction=1.2 * WEIGHT), actuation="torque")
     sim = simulator(robot)
     found = sim.equilibrium(sim.initial_state())
-    slip = float(sim.parameters().joint_slip_rates) * H
+    slip = float(sim.default_parameters().joint_slip_rates) * H
     share = float(found.joint_positions) / slip
     # It yields by 6e-7 rad, which the solver finds up to its tolerance.
     assert share * (2.0 - share) == pytest.approx(1.0 / 1.2, rel=1e-5)
@@ -454,7 +456,7 @@ def test_gradients_of_an_equilibrium_by_limits_friction_and_start(tmp_path):
     def end(inputs):
         given = {n: t for n, t in inputs.items() if n != "start"}
         state = start.replace(joint_positions=inputs["start"])
-        found = sim.equilibrium(state, up, sim.parameters().replace(**given))
+        found = sim.equilibrium(state, up, sim.default_parameters().replace(**given))
         return (found.joint_positions * tensor(1.0, -0.6)).sum() + 0.1 * found.joint_efforts.sum()
 
     leaves = {n: t.clone().requires_grad_() for n, t in values.items()}
@@ -474,7 +476,7 @@ def test_an_arm_rests_on_its_limit_where_a_rollout_leaves_it(tmp_path):
     path = arm_file(tmp_path)
     path.write_text(path.read_text().replace('upper="20"', 'upper="0.3"'))
     sim = simulator(dc.Robot.load(path, actuation="torque"))
-    slow = sim.parameters().replace(joint_viscosity=tensor(0.5))
+    slow = sim.default_parameters().replace(joint_viscosity=tensor(0.5))
     with torch.no_grad():
         end = sim.rollout(sim.initial_state(), parameters=slow, steps=150)[-1]
         found = sim.equilibrium(sim.initial_state(), None, slow)

@@ -93,7 +93,7 @@ def test_a_floating_gripper_takes_up_the_impulse_of_contact(coupling):
 
 def spins(sim, state):
     """Angular momentum of each body about its center, [K, 3]."""
-    turn, inertia = matrices(state.body_poses)[:, :3, :3], sim.parameters().body_inertia
+    turn, inertia = matrices(state.body_poses)[:, :3, :3], sim.default_parameters().body_inertia
     rates = state.body_velocities[:, 3:, None]
     return (turn @ inertia @ turn.mT @ rates)[..., 0]
 
@@ -226,7 +226,7 @@ def swimmer(tmp_path, dt, bodies=(), **options):
 
 
 def center_of_mass(sim, state):
-    given = sim.parameters()
+    given = sim.default_parameters()
     frames = torch.stack(list(sim.link_poses(state).values()))
     places = (frames[:, :3, :3] @ given.link_center[..., None])[..., 0] + frames[:, :3, 3]
     return (given.link_mass[:, None] * places).sum(0) / given.link_mass.sum()
@@ -270,11 +270,11 @@ def test_a_robot_that_strikes_a_box_keeps_their_momentum(tmp_path, friction):
     state = sim.initial_state()
     thrown = torch.tensor([[0.1, -0.5, 0.05, 1.0, 2.0, -3.0]], dtype=F64)
     state = state.replace(body_velocities=thrown)
-    mass, touched = sim.parameters().body_mass[0], False
+    mass, touched = sim.default_parameters().body_mass[0], False
 
     def of_robot(state):
         velocities = sim.link_velocities(state).values()
-        masses = sim.parameters().link_mass
+        masses = sim.default_parameters().link_mass
         return sum(m * v[:3] for m, v in zip(masses, velocities, strict=True))
 
     for k in range(60):

@@ -18,7 +18,7 @@ def rollout(base, steps, **options):
     hand = dc.Robot.load(GRIPPER, base=base, actuation="pd", stiffness=50.0, damping=0.5)
     contact = dc.ContactOptions(barrier_distance=1e-3)
     sim = dc.Simulator(dc.Scene([], robots=[hand]), 0.01, contact=contact)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     parameters = parameters.replace(link_mass=parameters.link_mass.requires_grad_())
     control = sim.control(joint_positions=[0.03, 0.02])
     states = sim.rollout(sim.initial_state(), [control] * steps, parameters, **options)

@@ -306,7 +306,7 @@ PARAMETERS = {
 @pytest.mark.parametrize("name", [*STATE, *PARAMETERS])
 def test_gradients_are_central_differences(in_contact, name):
     sim, state = in_contact
-    given = state if name in STATE else sim.parameters()
+    given = state if name in STATE else sim.default_parameters()
     weights = torch.Generator().manual_seed(4)
 
     def noise(like):
@@ -382,7 +382,7 @@ def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
     faces = np.array(sim.scene.cloths[0].faces)
     gaps = [distance(state.positions.numpy(), faces, ends) - 0.12 for state in states]
     assert min(gaps) > 0
-    assert gaps[-1] < float(sim.parameters().barrier_distance)
+    assert gaps[-1] < float(sim.default_parameters().barrier_distance)
     # The report says the same of what is in contact.
     reported = [float(state.report.minimum_distance) for state in states]
     touching = [k for k, value in enumerate(reported) if math.isfinite(value)]
@@ -407,7 +407,7 @@ def test_it_carries_the_weight_of_the_cloth(kind):
     body, _ = below(kind, smooth=True, friction=2.0)
     sim, states = drape(body, n=10, solver=dc.SolverOptions(tolerance=1e-7))
     state = sim.equilibrium(states[-1])
-    weight = float(sim.parameters().density * 0.25 * G)
+    weight = float(sim.default_parameters().density * 0.25 * G)
     assert float(sim.contact_wrenches(state)["body0"][2]) == pytest.approx(-weight, rel=1e-6)
 
 
@@ -572,7 +572,7 @@ def thrown(kind, radius, thickness):
     start = sim.initial_state()
     speed = torch.tensor([[0.2, 0.1, -1.0, 1.0, 2.0, 3.0]], dtype=F64)
     state = start.replace(body_velocities=speed)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     given = parameters.thickness.clone().requires_grad_()
     for _ in range(8):
         state = sim.step(state, parameters=parameters.replace(thickness=given))

@@ -100,7 +100,7 @@ def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
     assert robot.ignore_contact == tuple(("base", f"finger{k}") for k in ("", "/1", "/2"))
     sim = dc.Simulator(dc.Scene([], robots=[robot]), 0.01, contact=BARRIER)
     assert sim.surfaces == ("arm/base", "arm/finger", "arm/finger/1", "arm/finger/2")
-    np.testing.assert_array_equal(sim.parameters().thickness, [0, 2e-3, 2e-3, 2e-3])
+    np.testing.assert_array_equal(sim.default_parameters().thickness, [0, 2e-3, 2e-3, 2e-3])
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ def pressed(folder, coupling, shapes=ROD + TIP):
     solver = dc.SolverOptions(tolerance=1e-12, max_iterations=2000)
     scene = dc.Scene([sheet(6)], robots=[robot], gravity=[0.3, 0.2, -9.81 / heavy])
     sim = dc.Simulator(scene, 0.005, coupling=coupling, contact=contact, solver=solver)
-    given = sim.parameters()
+    given = sim.default_parameters()
     given = given.replace(
         link_mass=heavy * given.link_mass, link_inertia=heavy * given.link_inertia
     )

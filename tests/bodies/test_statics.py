@@ -208,7 +208,7 @@ def test_gradients_of_what_lies_on_pinned_cloth_are_those_of_differences():
     shape = torch.linspace(0, 1, 3 * len(rows), dtype=F64).reshape(-1, 3)
 
     def end(theta):
-        given = sim.parameters()
+        given = sim.default_parameters()
         thickness = torch.stack([1e-3 * theta[2], 0 * theta[2]])
         given = given.replace(body_mass=theta[1:2], thickness=thickness)
         pins = start.positions[rows] + 1e-4 * theta[0] * shape
@@ -256,7 +256,7 @@ def test_a_joint_driven_at_its_limit_stops_within_a_hundredth_of_its_range(
     near = limit - side * 0.05 * span
     arm = load_arm(tmp_path, actuation="torque", joint_positions={joint: near}, name="arm")
     sim = weightless(arm)
-    given = sim.parameters()
+    given = sim.default_parameters()
     # Something to damp what the limit throws back.
     given = given.replace(joint_viscosity=torch.full((3,), 1.0, dtype=F64))
     control = sim.control(joint_efforts={joint: side * effort})
@@ -335,7 +335,7 @@ def test_a_wall_pushes_an_arm_that_is_alone_with_it(tmp_path):
         DT,
         contact=dc.ContactOptions(barrier_distance=2e-3),
     )
-    assert sim.parameters().barrier_stiffness > 0
+    assert sim.default_parameters().barrier_stiffness > 0
     state = sim.initial_state()
     with torch.no_grad():
         for _ in range(8):

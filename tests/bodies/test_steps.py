@@ -175,7 +175,7 @@ def test_links_move_as_their_poses_change(sim):
         base_velocities=torch.cat([torch.zeros(1, 6, dtype=F64), state.base_velocities[1:]])
     )
     velocities = sim.link_velocities(state)
-    centers = sim.parameters().link_center
+    centers = sim.default_parameters().link_center
     h = 1e-6
 
     def centers_at(time):
@@ -438,7 +438,7 @@ def test_gradients_of_two_steps_are_those_of_differences(sim, record, name):
         joint_efforts=torch.tensor([0.0, 0.2, 0.05, 0.0, 0.0], dtype=F64),
         base_wrenches=torch.cat([torch.zeros(1, 6, dtype=F64), torch.ones(1, 6, dtype=F64) / 10]),
     )
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     parameters = parameters.replace(
         joint_damping=parameters.joint_damping + 0.05,
         joint_viscosity=parameters.joint_viscosity + 0.02,

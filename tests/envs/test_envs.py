@@ -118,8 +118,8 @@ def test_steps_keep_the_graph_until_it_is_cleared():
 def test_a_parameter_has_a_gradient():
     env = make("DropCloth", 2)
     env.reset(seed=0)
-    density = env.task.simulator.parameters().density.requires_grad_()
-    env.parameters = env.task.simulator.parameters().replace(density=density)
+    density = env.task.simulator.default_parameters().density.requires_grad_()
+    env.parameters = env.task.simulator.default_parameters().replace(density=density)
     for _ in range(3):
         reward = env.step(env.scripted_actions())[1]
     (gradient,) = torch.autograd.grad(reward.sum(), density)

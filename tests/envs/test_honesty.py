@@ -302,7 +302,7 @@ def test_ranges_hold_values():
     assert bool(((cube >= 0.05) & (cube <= 0.06)).all())
     assert parameters.friction is None
     inertia = parameters.body_inertia[:, 0]
-    one = env.task.simulator.parameters()
+    one = env.task.simulator.default_parameters()
     torch.testing.assert_close(
         inertia / cube[:, None, None], (one.body_inertia[0] / one.body_mass[0]).expand(3, 3, 3)
     )

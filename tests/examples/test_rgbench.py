@@ -145,7 +145,7 @@ def test_a_stiffness_is_fitted_to_a_capture(recorded):
     sim = garment()
 
     def residuals(parameters):
-        given = sim.parameters().replace(stretch=parameters.stretch)
+        given = sim.default_parameters().replace(stretch=parameters.stretch)
         states = swing(sim, given, 20)
         seen = [states[k - 1] for k in capture.steps(DT)]
         return dc.residuals.point_cloud(seen, capture.clouds, noise=1e-3)

@@ -218,8 +218,8 @@ def test_a_free_body_has_gradients_by_everything(make):
     }
     names = ("positions", "velocities", "body_poses", "body_velocities")
     inputs = {name: getattr(state, name) for name in names} | control
-    inputs["attachment_stiffness"] = sim.parameters().attachment_stiffness
-    inputs["body_mass"] = sim.parameters().body_mass
+    inputs["attachment_stiffness"] = sim.default_parameters().attachment_stiffness
+    inputs["body_mass"] = sim.default_parameters().body_mass
     inputs = {name: tensor for name, tensor in inputs.items() if tensor.numel()}
     outputs = ("positions", "velocities", "body_poses", "body_velocities", "body_forces")
     # Forces alone, too: their gradient is not that of positions.
@@ -227,7 +227,7 @@ def test_a_free_body_has_gradients_by_everything(make):
 
         def step(values):
             given = state.replace(**{n: values[n] for n in names if n in values})
-            parameters = sim.parameters().replace(
+            parameters = sim.default_parameters().replace(
                 attachment_stiffness=values["attachment_stiffness"], body_mass=values["body_mass"]
             )
             return sim.step(given, dc.Control(**{n: values[n] for n in control}), parameters)
@@ -282,7 +282,7 @@ def test_batches_are_their_environments(make):
     }
     state = dc.stack([case.state] * 3)
     control = {k: batch[f"control.{k}"] for k in case.control}
-    parameters = case.sim.parameters().replace(
+    parameters = case.sim.default_parameters().replace(
         attachment_stiffness=batch["parameters.attachment_stiffness"]
     )
     together = case.sim.step(state, dc.Control(**control), parameters)
@@ -338,7 +338,7 @@ def test_links_have_gradients(kind):
 def test_the_energy_has_the_gradients_of_springs(make):
     """By positions, poses and stiffness, where all springs between points pull with weight one."""
     case = make()
-    state, parameters = case.state, case.sim.parameters()
+    state, parameters = case.state, case.sim.default_parameters()
     inputs = {
         "positions": state.positions,
         "attachment_stiffness": parameters.attachment_stiffness,
@@ -349,7 +349,9 @@ def test_the_energy_has_the_gradients_of_springs(make):
     def energy(values):
         given = dict(values)
         stiffer = parameters.replace(attachment_stiffness=given.pop("attachment_stiffness"))
-        return case.sim.energy(state.replace(**given), stiffer, parts=True)["attachments"]
+        return case.sim.energy(state.replace(**given), parameters=stiffer, parts=True)[
+            "attachments"
+        ]
 
     leaves = {n: t.clone().requires_grad_() for n, t in inputs.items()}
     value = energy(leaves)

@@ -77,7 +77,7 @@ def test_gradients_through_what_a_robot_carries(package, name):
     path = robot_file(package, name)
     robot, span = inside_its_limits(path, base="kinematic", actuation="position")
     simulator = carrying(robot)
-    start, given = simulator.initial_state(), simulator.parameters()
+    start, given = simulator.initial_state(), simulator.default_parameters()
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(2, len(span), dtype=F64, generator=generator)
     contacts = []
@@ -107,7 +107,7 @@ def test_gradients_through_drives_that_carry(package, name):
     """By targets and gains of the drives, and efforts beside them; forces move all joints."""
     robot, span = inside_its_limits(robot_file(package, name), stiffness=50.0, damping=5.0)
     simulator = carrying(robot)
-    start, given = simulator.initial_state(), simulator.parameters()
+    start, given = simulator.initial_state(), simulator.default_parameters()
     generator = torch.Generator().manual_seed(2)
     noise = torch.randn(5, len(span), dtype=F64, generator=generator)
     contacts = []

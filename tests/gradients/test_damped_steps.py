@@ -53,7 +53,7 @@ def test_gradients_of_a_step_do_not_depend_on_other_steps():
 def test_other_parameters_at_the_same_start_are_other_steps(changed):
     sim = simulator(0.02)
     start = bent(sim, 0.2)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     other = parameters.replace(**{changed: 3 * getattr(parameters, changed)})
     first = moved(sim, start, parameters)
     assert abs(moved(sim, start, other) / first - 1) > 1e-3

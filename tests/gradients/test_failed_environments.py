@@ -38,7 +38,9 @@ def step(sim, state, v):
     v = v.clone().requires_grad_()
     gravity = torch.tensor([0.1, 0.2, -9.81], dtype=F64, requires_grad=True)
     after = sim.step(
-        state.replace(positions=x, velocities=v), None, sim.parameters().replace(gravity=gravity)
+        state.replace(positions=x, velocities=v),
+        None,
+        sim.default_parameters().replace(gravity=gravity),
     )
     return after, (x, v, gravity)
 
@@ -137,15 +139,15 @@ def test_an_environment_outside_the_loss_is_not_solved_for():
 
 def test_stiffnesses_that_float64_cannot_hold_fail_where_they_are():
     sim = falling(max_iterations=200)
-    stretch = sim.parameters().stretch.expand(3).clone()
+    stretch = sim.default_parameters().stretch.expand(3).clone()
     stretch[FAILED] = 1e22
     v = 1e-3 * velocities(sim)
     state = sim.initial_state(3).replace(velocities=v)
-    after = sim.step(state, None, sim.parameters().replace(stretch=stretch))
+    after = sim.step(state, None, sim.default_parameters().replace(stretch=stretch))
     assert after.report.status == ("converged", "not_converged", "converged")
     assert torch.isinf(after.report.residual[FAILED])  # there is no Newton step
     assert torch.equal(after.positions[0], sim.step(state[0]).positions)
     throwing = falling(max_iterations=200, throw=True)
     message = r"environments \[1\].*not even the projected Hessian has a factor"
     with pytest.raises(dc.NotConverged, match=message):
-        throwing.step(state, None, throwing.parameters().replace(stretch=stretch))
+        throwing.step(state, None, throwing.default_parameters().replace(stretch=stretch))

@@ -45,7 +45,7 @@ def step(kind, sim, state, wanted):
     x = state.positions.clone().requires_grad_()
     wanted = wanted.clone().requires_grad_()
     gravity = torch.tensor([0.1, 0.2, -0.5], dtype=F64, requires_grad=True)
-    parameters = sim.parameters().replace(gravity=gravity)
+    parameters = sim.default_parameters().replace(gravity=gravity)
     after = sim.step(state.replace(positions=x), control(kind, wanted), parameters)
     return after, (x, wanted, gravity)
 

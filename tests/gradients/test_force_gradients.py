@@ -40,7 +40,7 @@ def test_forces_change_the_momentum(name, scheme, metric):
     case = scenes.regime(name, scheme, metric)
     case = case.where(parameters={**case.parameters, "air_density": torch.zeros((), dtype=F64)})
     after, tensors, sim = case.step(), case.inputs(), case.sim
-    masses = sim.vertex_masses(sim.parameters().replace(**case.parameters))[:, None]
+    masses = sim.vertex_masses(sim.default_parameters().replace(**case.parameters))[:, None]
     change = (masses * (after.velocities - case.state.velocities)).sum(0) / sim.dt
     parts = [
         masses * tensors["parameters.gravity"],
@@ -115,7 +115,7 @@ def test_gradients_of_forces_with_a_body_that_they_move(coupling):
     masses = sim.vertex_masses()[:, None]
     after = sim.step(state.replace(body_velocities=spin))
     change = (masses * (after.velocities - state.velocities)).sum(0) / sim.dt
-    total = (masses * sim.parameters().gravity).sum(0)
+    total = (masses * sim.default_parameters().gravity).sum(0)
     total = total + after.contact_forces.sum(0) + after.pin_forces.sum(0)
     torch.testing.assert_close(change, total, rtol=1e-7, atol=1e-7)
     on_all = after.contact_forces.sum(0) + after.body_forces.sum(0)
@@ -130,13 +130,13 @@ def test_gradients_of_forces_with_a_body_that_they_move(coupling):
     inputs = {
         "body_velocities": (spin, 1e-3),
         "positions": (state.positions, 1e-5),
-        "body_mass": (sim.parameters().body_mass, 1e-3),
-        "friction": (sim.parameters().friction, 1e-3),
+        "body_mass": (sim.default_parameters().body_mass, 1e-3),
+        "friction": (sim.default_parameters().friction, 1e-3),
     }
 
     def loss(name, value):
         fields = {"body_velocities": spin}
-        physical = sim.parameters()
+        physical = sim.default_parameters()
         if name in ("body_velocities", "positions"):
             fields[name] = value
         else:

@@ -82,7 +82,7 @@ def test_a_batch_gets_the_gradients_of_a_loop(scheme):
     x = state.positions.clone().requires_grad_()
     v = scenes.tensor_noise((3, 25, 3), 0.05) - torch.tensor([0.0, 0.0, 0.4], dtype=F64)
     v.requires_grad_()
-    shared = sim.parameters()
+    shared = sim.default_parameters()
     names = ("stretch", "density", "friction", "rest_positions")
     parameters = {n: getattr(shared, n).clone().requires_grad_() for n in names}
     after = sim.step(state.replace(positions=x, velocities=v), None, shared.replace(**parameters))
@@ -122,11 +122,11 @@ def test_rollouts_with_bodies_and_robots_get_the_gradients_of_a_loop(coupling, c
         "joint_velocities": scenes.tensor_noise(state.joint_velocities.shape, 0.1),
     }
     leaves = {name: t.requires_grad_() for name, t in leaves.items()}
-    mass = sim.parameters().body_mass.clone().requires_grad_()
+    mass = sim.default_parameters().body_mass.clone().requires_grad_()
     end = sim.rollout(
         state.replace(**leaves),
         None,
-        sim.parameters().replace(body_mass=mass),
+        sim.default_parameters().replace(body_mass=mass),
         steps=3,
         checkpoint_every=checkpoint_every,
     )[-1]

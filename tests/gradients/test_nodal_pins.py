@@ -45,7 +45,7 @@ def test_derivatives_match_differences(scheme, name):
     def random(shape):
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
-    start, parameters = sim.initial_state(), sim.parameters()
+    start, parameters = sim.initial_state(), sim.default_parameters()
     velocity = torch.tensor([0.3, 0.0, -0.3], dtype=torch.float64)
     start = start.replace(velocities=velocity + 0.1 * random(start.velocities.shape))
     values = {

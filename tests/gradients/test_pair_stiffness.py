@@ -44,7 +44,7 @@ def case(scheme, metric, iterations):
     sim = scenes.simulator(
         cloths, boxes, scheme=scheme, metric=metric, friction_iterations=iterations
     )
-    parameters = sim.parameters().replace(barrier_stiffness=STIFFNESS)
+    parameters = sim.default_parameters().replace(barrier_stiffness=STIFFNESS)
     with torch.no_grad():
         state = sim.rollout(sim.initial_state(), parameters=parameters, steps=6)[-1].detach()
     velocities = state.velocities.clone()
@@ -81,7 +81,7 @@ def test_environments_have_the_gradients_that_they_have_alone(scheme):
     sim, loss = given.sim, make_loss(given)
     state = dc.stack([given.state] * 2)
     stiffness = torch.stack([STIFFNESS, 1.3 * STIFFNESS.T]).requires_grad_()
-    end = sim.step(state, None, sim.parameters().replace(barrier_stiffness=stiffness))
+    end = sim.step(state, None, sim.default_parameters().replace(barrier_stiffness=stiffness))
     (found,) = torch.autograd.grad(loss(end[0]) + loss(end[1]), stiffness)
     for k in range(2):
         alone = given.where(parameters={"barrier_stiffness": stiffness[k].detach()})
@@ -89,6 +89,6 @@ def test_environments_have_the_gradients_that_they_have_alone(scheme):
 
     # Shared by all environments, it has the sum of their gradients.
     shared = STIFFNESS.clone().requires_grad_()
-    end = sim.step(state, None, sim.parameters().replace(barrier_stiffness=shared))
+    end = sim.step(state, None, sim.default_parameters().replace(barrier_stiffness=shared))
     (together,) = torch.autograd.grad(loss(end[0]) + loss(end[1]), shared)
     torch.testing.assert_close(together, 2.0 * found[0], rtol=1e-12, atol=0)

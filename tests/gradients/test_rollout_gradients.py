@@ -76,7 +76,9 @@ def rolled(case, steps):
     force_weights = 0.1 * torch.randn(state.body_forces.shape, dtype=F64, generator=g)
     with torch.no_grad():
         end = case.sim.rollout(
-            state, [dc.Control(forces=case.control["forces"])] * steps, case.sim.parameters()
+            state,
+            [dc.Control(forces=case.control["forces"])] * steps,
+            case.sim.default_parameters(),
         )[-1]
 
     def loss(positions, velocities, forces, poses=state.body_poses, **parameters):
@@ -84,7 +86,7 @@ def rolled(case, steps):
         states = case.sim.rollout(
             start,
             [dc.Control(forces=forces)] * steps,
-            case.sim.parameters().replace(**parameters),
+            case.sim.default_parameters().replace(**parameters),
         )
         last = states[-1]
         return (
@@ -93,7 +95,7 @@ def rolled(case, steps):
             + 0.1 * ((last.body_forces - end.body_forces) * force_weights).sum()
         )
 
-    parameters = case.sim.parameters()
+    parameters = case.sim.default_parameters()
     leaves = {
         "positions": state.positions,
         "velocities": state.velocities,
@@ -212,7 +214,7 @@ def test_a_vertex_on_a_soft_pin_is_the_implicit_euler_recursion():
         positions=start.positions + offset * along,
         velocities=start.velocities + speed * along,
     )
-    parameters = sim.parameters().replace(pin_stiffness=stiffness, density=3 * mass / area)
+    parameters = sim.default_parameters().replace(pin_stiffness=stiffness, density=3 * mass / area)
     last = sim.rollout(state, steps=steps, parameters=parameters)[-1]
 
     x, v = x0, v0

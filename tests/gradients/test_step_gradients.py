@@ -134,7 +134,7 @@ def contact_slip(case, after):
         x.numpy() @ m[:3, :3].T + m[:3, 3]
         for x, m in zip((case.state.positions, after.positions), inverse, strict=True)
     ]
-    reach = 0.01 + case.sim.parameters().thickness.max().item()
+    reach = 0.01 + case.sim.default_parameters().thickness.max().item()
     touching = (np.abs(local[1][:, :2]) < half[:2]).all(axis=1)
     touching &= local[1][:, 2] < half[2] + reach
     return np.linalg.norm((local[1] - local[0])[touching, :2], axis=1)
@@ -152,14 +152,14 @@ def test_sticking_and_sliding_are_what_they_say():
     case = scenes.regime("sticking")
     after = case.step()
     slip = contact_slip(case, after)
-    limit = case.sim.parameters().slip_velocity.item() * scenes.DT
+    limit = case.sim.default_parameters().slip_velocity.item() * scenes.DT
     assert len(slip) >= 4
     assert 1e-5 < slip.max() < limit
     for name in ("sliding", "separating", "thick"):
         case = scenes.regime(name)
         slip = contact_slip(case, case.step())
         assert len(slip) >= 4
-        assert slip.min() > case.sim.parameters().slip_velocity.item() * scenes.DT
+        assert slip.min() > case.sim.default_parameters().slip_velocity.item() * scenes.DT
 
 
 @pytest.mark.parametrize("name", [n for n in scenes.REGIMES if n not in (*ZERO, "leaving")])
@@ -204,7 +204,7 @@ def test_a_pinned_vertex_is_in_contact():
     pin = frame[:3, :3] @ after.positions[14].numpy() + frame[:3, 3]
     half = np.array(case.sim.scene.bodies[0].vertices).max(axis=0)
     assert (np.abs(pin[:2]) < half[:2]).all()
-    assert 0 < pin[2] - half[2] < 0.95 * case.sim.parameters().barrier_distance.item()
+    assert 0 < pin[2] - half[2] < 0.95 * case.sim.default_parameters().barrier_distance.item()
 
 
 def test_free_flight_is_free():
@@ -230,7 +230,7 @@ def test_some_edges_in_contact_are_nearly_parallel(name):
     u = x[edges[:, 1]] - x[edges[:, 0]]
     length_sq = ((rest[edges[:, 1]] - rest[edges[:, 0]]) ** 2).sum(axis=1)
     q = (np.cross(u[:, None], u[None]) ** 2).sum(axis=-1) / (length_sq[:, None] * length_sq)
-    parameters = case.sim.parameters()
+    parameters = case.sim.default_parameters()
     reach = parameters.barrier_distance.item() + parameters.thickness.mean().item()
     found = [
         (i, j)
@@ -479,10 +479,10 @@ def test_a_cloth_elsewhere_changes_no_derivative_by_the_rest_shape():
     weights, direction = torch.randn(2, 36, 3, dtype=F64, generator=generator)
     found = []
     for sim, begin in ((case.sim, case.state), (both, state)):
-        rest = sim.parameters().rest_positions
+        rest = sim.default_parameters().rest_positions
 
         def loss(own, sim=sim, begin=begin, rest=rest):
-            given = sim.parameters().replace(rest_positions=torch.cat([rest[:-36], own]))
+            given = sim.default_parameters().replace(rest_positions=torch.cat([rest[:-36], own]))
             after = sim.step(begin, dc.Control(**case.control), given)
             return (weights * (after.positions[-36:] - case.state.positions)).sum()
 
@@ -515,7 +515,9 @@ def test_what_lands_feels_friction_in_the_same_step():
 def test_scenes_are_differentiable_in_everything():
     """No input is forgotten by these tests."""
     sim = scenes.regime("woven_pinned").sim
-    parameters = {k for k, v in vars(sim.parameters()).items() if isinstance(v, torch.Tensor)}
+    parameters = {
+        k for k, v in vars(sim.default_parameters()).items() if isinstance(v, torch.Tensor)
+    }
     seen = {name for regime in scenes.REGIMES for name in scenes.regime(regime).inputs()}
     assert seen == {
         *(f"state.{name}" for name in scenes.STATE),

@@ -161,7 +161,7 @@ def test_environments_share_parameters():
     case = scenes.regime("sphere")
     sim = case.sim
     start = dc.stack([case.state, case.state.replace(velocities=1.5 * case.state.velocities)])
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
 
     def step(values):
         x, gravity, stretch, forces = values
@@ -178,7 +178,7 @@ def test_environments_share_parameters():
 
 def test_equilibria():
     sim = resting.drape()
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     names = ("bending", "stretch", "friction", "gravity", "rest_positions", "thickness")
 
     def rest(values):
@@ -191,12 +191,13 @@ def test_equilibria():
 
 def test_energies():
     case = scenes.regime("folded")
-    sim, parameters = case.sim, case.sim.parameters()
+    sim, parameters = case.sim, case.sim.default_parameters()
     names = ("bending", "stretch", "thickness", "gravity", "rest_positions", "density")
 
     def energies(values):
         given = parameters.replace(**dict(zip(names, values[1:], strict=True)))
-        return list(sim.energy(case.state.replace(positions=values[0]), given, parts=True).values())
+        state = case.state.replace(positions=values[0])
+        return list(sim.energy(state, parameters=given, parts=True).values())
 
     check(energies, [case.state.positions, *(getattr(parameters, n) for n in names)])
 
@@ -220,7 +221,7 @@ def test_many_directions_take_one_call(transform, monkeypatch):
             return core.tangent(inputs, tape, kept, tangents, directions, threads)
 
     monkeypatch.setattr(case.sim._engine, "core", Spy())
-    parameters = case.sim.parameters()
+    parameters = case.sim.default_parameters()
 
     def step(theta):
         given = parameters.replace(gravity=theta[:3], bending=theta[3], barrier_distance=theta[4])
@@ -255,7 +256,7 @@ def test_many_directions_take_one_call(transform, monkeypatch):
 
 def test_a_jacobian_of_a_rollout_against_differences():
     case = scenes.regime("sphere")
-    parameters = case.sim.parameters()
+    parameters = case.sim.default_parameters()
 
     def end(theta):
         given = parameters.replace(stretch=theta[0], bending=theta[1], friction=theta[2])

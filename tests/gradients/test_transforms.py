@@ -33,14 +33,14 @@ CALLS = {
         -1
     ].positions.sum(),
     "parameters of a rollout": lambda sim, x: sim.rollout(
-        sim.initial_state(), parameters=sim.parameters().replace(gravity=x[0]), steps=1
+        sim.initial_state(), parameters=sim.default_parameters().replace(gravity=x[0]), steps=1
     )[-1].positions.sum(),
     "momentum": lambda sim, x: sim.momentum(moving(sim, x)).sum(),
     "kinetic_energy": lambda sim, x: sim.kinetic_energy(moving(sim, x)).sum(),
     "link_poses": lambda sim, x: sum(t.sum() for t in sim.link_poses(moving(sim, x)).values()),
     "contact_wrenches": lambda sim, x: sim.contact_wrenches(moving(sim, x))["ball"].sum(),
     "vertex_masses": lambda sim, x: sim.vertex_masses(
-        sim.parameters().replace(density=x.sum() + 1)
+        sim.default_parameters().replace(density=x.sum() + 1)
     ).sum(),
 }
 

@@ -55,7 +55,7 @@ class TestInit:
     @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
     def test_begins_at_the_weights(self, begun, algorithm):
         """With another algorithm, rate, horizon, number of environments and length of episodes."""
-        options = replace(OPTIONS, algorithm=algorithm, actor_rate=1e-4, horizon=2, held_out=0)
+        options = replace(OPTIONS, algorithm=algorithm, learning_rate=1e-4, horizon=2, held_out=0)
         longer = functools.partial(dc.envs.make, "FoldCloth", size=5, horizon=6, **SOFT)
         trainer = Trainer(longer, options, num_envs=3, init=begun)
         observation, _ = longer(num_envs=2).reset(seed=0)
@@ -116,7 +116,9 @@ class TestTrustRegion:
             return float((trainer.policy(rows) - before(rows)).square().mean().sqrt()), log
 
     def test_bounds_the_change_of_actions(self, begun, monkeypatch):
-        bounded = replace(OPTIONS, actor_rate=0.05, plan_rate=0.2, max_change=0.01, held_out=0)
+        bounded = replace(
+            OPTIONS, learning_rate=0.05, plan_learning_rate=0.2, max_change=0.01, held_out=0
+        )
         change, log = self.changes(Trainer(make, bounded, num_envs=2, init=begun), monkeypatch)
         # By bisection to 1e-6 of the update.
         assert 0.0099 < change <= 0.01

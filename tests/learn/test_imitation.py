@@ -17,7 +17,7 @@ from diffcloth_torch.learn.starts import part_seeds
 
 MAKE = functools.partial(envs.make, "FoldCloth", size=4, horizon=5)
 SOFT = functools.partial(MAKE, opens_at=-1.0, reach=0.06)
-OPTIONS = TrainerOptions("apg", plan_knots=3, hidden=(16,), deviation=0.05)
+OPTIONS = TrainerOptions("apg", plan_knots=3, hidden=(16,), init_std=0.05)
 FEW = {"rounds": 2, "episodes": 2, "seed": 3, "iterations": 40, "options": OPTIONS}
 
 

@@ -252,6 +252,7 @@ def test_a_seed_that_succeeds_is_the_last_one(config, tmp_path):
         ("environment.name=Fold", "`task` must be one of"),
         ("environment.options.bend=1", "an option of FoldCloth must be one of"),
         ("trainer.speed=1", "`trainer` may have algorithm"),
+        ("trainer.target_rate=0.5", "got 'target_rate'; since 0.2.0 its name is `tau`"),
         ("trainer.horizon=0", "`horizon` must be"),
         ("workers.kind=dask", "workers.kind"),
         ("workers.kind=ranks", "under torchrun"),
@@ -272,5 +273,7 @@ def test_resume_needs_results(tmp_path):
     assert result.exit_code == 2
     assert "must hold what `diffcloth train` wrote" in result.output
     (tmp_path / "resume.json").write_text("{}")
-    assert "is of diffcloth_torch before 0.2.0, which" in call("--resume", tmp_path).output
+    assert (
+        "resume.json is damaged, its content raises KeyError" in call("--resume", tmp_path).output
+    )
     assert call().exit_code == 2

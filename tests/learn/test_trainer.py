@@ -26,6 +26,7 @@ from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.networks import Actor, Plan, Scale
 from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
+from diffcloth_torch.saved_0_1 import OPTIONS
 
 HOLD = (0.0, 0.0, 0.1, 0.9, 0.0, 0.0, 0.1, 0.9)
 SOFT = {"opens_at": -1.0, "reach": 0.06}
@@ -61,7 +62,7 @@ class TestGradient:
     """Of the loss of one rollout, with a critic that is far from constant."""
 
     OPTIONS = TrainerOptions(
-        algorithm="shac", horizon=5, first_action=HOLD, feedback=True, deviation=0.02
+        algorithm="shac", horizon=5, first_action=HOLD, feedback=True, init_std=0.02
     )
 
     @staticmethod
@@ -175,8 +176,8 @@ class TestPlan:
 
     def test_has_a_rate_of_its_own(self):
         options = TrainerOptions(
-            "apg", horizon=8, first_action=HOLD, plan_knots=3, plan_rate=0.3, actor_rate=0.01,
-            decay_updates=2,
+            "apg", horizon=8, first_action=HOLD, plan_knots=3,
+            plan_learning_rate=0.3, learning_rate=0.01, decay_updates=2,
         )  # fmt: skip
         trainer = Trainer(fold(), options, num_envs=2)
         before = state_of(trainer)
@@ -250,7 +251,12 @@ class TestTensorAdam:
         moved = {}
         for scale in ("number", "tensor"):
             options = TrainerOptions(
-                "apg", horizon=8, first_action=HOLD, plan_knots=3, plan_rate=0.1, scale=scale
+                "apg",
+                horizon=8,
+                first_action=HOLD,
+                plan_knots=3,
+                plan_learning_rate=0.1,
+                scale=scale,
             )
             trainer = Trainer(fold(), options, num_envs=2)
             before = trainer.policy.actor.plan.knots.detach().clone()
@@ -317,7 +323,7 @@ class TestEntropy:
 
     def test_is_part_of_the_loss_and_of_what_critics_learn(self):
         """With rewards far below what entropy is worth, both are those of the entropy alone."""
-        options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, trace=1.0)
+        options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, gae_lambda=1.0)
         trainer = Trainer(fold(), options, num_envs=2)
         (rollout,) = trainer._rollouts()
         worth = sum(0.5**t * rollout.entropies[t] for t in range(3)).mean()
@@ -589,7 +595,7 @@ def carry_strip(num_envs):
 @pytest.mark.quick("*-0", "apg-*")
 def test_it_improves(algorithm, seed):
     options = TrainerOptions(
-        algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05, seed=seed
+        algorithm=algorithm, horizon=10, learning_rate=4e-3, init_std=0.05, seed=seed
     )
     trainer = Trainer(carry_strip, options, num_envs=4)
     before, _, states = trainer.evaluate(4)
@@ -610,8 +616,8 @@ def test_a_plan_with_one_scale_improves_faster(seed):
     found = {}
     for scale in ("number", "tensor"):
         options = TrainerOptions(
-            "apg", horizon=10, plan_knots=5, plan_rate=0.03, actor_rate=3e-4, deviation=0.05,
-            scale=scale, seed=seed,
+            "apg", horizon=10, plan_knots=5, plan_learning_rate=0.03, learning_rate=3e-4,
+            init_std=0.05, scale=scale, seed=seed,
         )  # fmt: skip
         trainer = Trainer(lift_corner, options, num_envs=2)
         before, _, _ = trainer.evaluate(4)
@@ -624,7 +630,7 @@ def test_a_plan_with_one_scale_improves_faster(seed):
 
 def test_noise_and_scale_of_a_policy():
     env = fold()(num_envs=3)
-    policy = Policy(env, TrainerOptions(first_action=HOLD, deviation=0.2))
+    policy = Policy(env, TrainerOptions(first_action=HOLD, init_std=0.2))
     observation, _ = env.reset(seed=0)
     quiet = policy(observation)
     torch.testing.assert_close(quiet, torch.tensor(HOLD).expand(3, -1), atol=0.03, rtol=0)
@@ -642,6 +648,18 @@ def test_noise_and_scale_of_a_policy():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("old", "new"), OPTIONS.items())
+def test_options_under_names_of_0_1_are_refused_with_the_new_ones(old, new):
+    message = f"`{old}` is no option; since 0.2.0 its name is `{new}`"
+    with pytest.raises(TypeError, match=message):
+        TrainerOptions(**{old: 0.1})
+    with pytest.raises(TypeError, match=message):
+        replace(TrainerOptions(), **{old: 0.1})
+    with pytest.raises(AttributeError, match=f"no attribute '{old}'; since .* is `{new}`"):
+        getattr(TrainerOptions(), old)
+    assert getattr(TrainerOptions(**{new: 0.25}), new) == 0.25
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -652,17 +670,20 @@ def test_noise_and_scale_of_a_policy():
         (lambda: TrainerOptions(critics=0), "`critics` must be"),
         (lambda: TrainerOptions(plan_knots=-1), "`plan_knots` must be"),
         (lambda: TrainerOptions(scale="row"), "`scale` must be one of 'number', 'tensor'"),
-        (lambda: TrainerOptions(plan_rate=0.0), "`plan_rate` must be positive and"),
+        (
+            lambda: TrainerOptions(plan_learning_rate=0.0),
+            "`plan_learning_rate` must be positive and",
+        ),
         (lambda: TrainerOptions(temperature=0.0), "`temperature` must be positive and"),
         (lambda: TrainerOptions(target_entropy=float("inf")), "`target_entropy` must be finite"),
-        (lambda: TrainerOptions(deviation="wide"), "`deviation` must be positive and below"),
+        (lambda: TrainerOptions(init_std="wide"), "`init_std` must be positive and below"),
         (lambda: TrainerOptions(feedback="no"), "`feedback` must be a bool, got 'no'"),
         (lambda: TrainerOptions(betas=(0.9,)), "`betas` must be two numbers"),
         (lambda: TrainerOptions(hidden=64), "`hidden` must be a tuple, got 64"),
         (lambda: TrainerOptions(hidden=(64, 0)), r"`hidden\[1\]` must be"),
         (lambda: TrainerOptions(horizon=0), "`horizon` must be"),
         (lambda: TrainerOptions(discount=1.5), r"`discount` must be in \[0, 1\], got 1.5"),
-        (lambda: TrainerOptions(actor_rate=float("nan")), "`actor_rate` must be positive"),
+        (lambda: TrainerOptions(learning_rate=float("nan")), "`learning_rate` must be positive"),
         (lambda: TrainerOptions(first_action=(1.0,)), r"`first_action\[0\]` must be between"),
         (lambda: Trainer(fold(), TrainerOptions(first_action=(0.0,))), "must have 8 numbers"),
         (lambda: Trainer(fold(), num_envs=4, chunk=3), "`chunk` must divide 4, got 3"),

@@ -54,7 +54,7 @@ def fall_on(robot):
     simulator = under_a_cloth(robot)
     state, most = simulator.initial_state(), 0
     for _ in range(5):
-        state = simulator.step(state, parameters=simulator.parameters())
+        state = simulator.step(state, parameters=simulator.default_parameters())
         most = max(most, state.report.contact_count)
     return most
 

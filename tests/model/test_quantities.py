@@ -107,7 +107,7 @@ def test_shapes_are_those_of_the_tables(sim):
     sizes = assemble(sim.scene).sizes
     cloth = {"N": 16, "F": 14, "C": 2, "P": 1, "Q": 1, "D": 0}
     assert sizes == {**cloth, "K": 2, "V": 5 * 8, "S": 7, "J": 2, "L": 3, "R": 1, "A": 3, "U": 2}
-    state, parameters = sim.initial_state(), sim.parameters()
+    state, parameters = sim.initial_state(), sim.default_parameters()
     for record, table in ((state, STATE), (parameters, PARAMETERS)):
         for name, quantity in table.items():
             accepted = [shape_of(axes, sizes) for axes in quantity.axes]
@@ -154,7 +154,7 @@ def test_a_default_comes_from_where_the_table_says(sim, name):
         assert field in getattr(dc, owner).__annotations__
     if not list(sources(name)):
         assert PARAMETERS[name].source == "zero"
-        assert not getattr(sim.parameters(), name).any()
+        assert not getattr(sim.default_parameters(), name).any()
 
 
 def outside(accepted):
@@ -170,9 +170,9 @@ BOUNDED = [(name, value) for name, q in PARAMETERS.items() for value in outside(
 @pytest.mark.parametrize(("name", "value"), BOUNDED)
 def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value):
     accepted = re.escape(str(PARAMETERS[name].accepted))
-    wrong = torch.full_like(getattr(sim.parameters(), name), value)
+    wrong = torch.full_like(getattr(sim.default_parameters(), name), value)
     with pytest.raises(dc.InvalidInput, match=rf"^step: `parameters\.{name}` must be {accepted}"):
-        sim.step(sim.initial_state(), None, sim.parameters().replace(**{name: wrong}))
+        sim.step(sim.initial_state(), None, sim.default_parameters().replace(**{name: wrong}))
     for owner, field in sources(name):
         if (owner, field) in (("Robot", "mechanism"), ("Robot", "viscosity")):
             continue  # a file says them

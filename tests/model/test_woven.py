@@ -70,7 +70,7 @@ def test_directions_belong_to_the_material():
     c, s = np.cos(0.7), np.sin(0.7)
     turned = torch.tensor(sheet.rest_positions @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
     expected = fallen(sheet)
-    found = fallen(sheet, parameters=sim.parameters().replace(rest_positions=turned))
+    found = fallen(sheet, parameters=sim.default_parameters().replace(rest_positions=turned))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
     other = fallen(cloth(directions=[c, s, 0.0]))
     assert (other - expected).abs().max() > 1e-5
@@ -101,18 +101,18 @@ def test_local_global_iterations_reach_the_minimizer_of_newton(metric, elastic):
 
 def test_a_scene_has_the_numbers_that_a_material_of_it_sets():
     other = dc.Cloth.grid(3, 3, pose=[0, 0, 1, 1, 0, 0, 0], material=dc.Material(stretch=300.0))
-    plain = dc.Simulator(dc.Scene([other]), 0.01).parameters()
+    plain = dc.Simulator(dc.Scene([other]), 0.01).default_parameters()
     assert all(getattr(plain, name) is None for name in WOVEN)
     stretch = dc.Simulator(dc.Scene([cloth(dc.Material(stretch_weft=5.0)), other]), 0.01)
-    parameters = stretch.parameters()
+    parameters = stretch.default_parameters()
     assert parameters.bending_weft is parameters.bending_twill is None
     assert parameters.stretch.tolist() == [550.0, 300.0]
     assert parameters.stretch_weft.tolist() == [5.0, 300.0]
     assert parameters.stretch_shear.tolist() == [550.0, 300.0]
-    both = dc.Simulator(dc.Scene([cloth(), other]), 0.01).parameters()
+    both = dc.Simulator(dc.Scene([cloth(), other]), 0.01).default_parameters()
     assert both.bending_twill.tolist() == [9e-6, 1e-5]
     per_face = dc.Material(bending_weft=np.full(32, 8e-6))
-    rows = dc.Simulator(dc.Scene([cloth(per_face), other]), 0.01).parameters().bending_weft
+    rows = dc.Simulator(dc.Scene([cloth(per_face), other]), 0.01).default_parameters().bending_weft
     assert rows.tolist() == [8e-6] * 32 + [1e-5] * 8
 
 
@@ -120,11 +120,11 @@ def test_parameters_by_name_and_in_batches_act():
     sheet = cloth(name="sheet")
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)
     weft = {"stretch_weft": torch.tensor(100.0, dtype=F64)}
-    by_name = sim.parameters().replace(stretch_weft={"sheet": weft["stretch_weft"]})
-    one = fallen(sheet, parameters=sim.parameters().replace(**weft))
+    by_name = sim.default_parameters().replace(stretch_weft={"sheet": weft["stretch_weft"]})
+    one = fallen(sheet, parameters=sim.default_parameters().replace(**weft))
     assert torch.equal(fallen(sheet, parameters=by_name), one)
     two = torch.tensor([100.0, 200.0], dtype=F64)
-    batched = fallen(sheet, parameters=sim.parameters().replace(stretch_weft=two), batch=2)
+    batched = fallen(sheet, parameters=sim.default_parameters().replace(stretch_weft=two), batch=2)
     assert torch.equal(batched[0], one)
     assert torch.equal(batched[1], fallen(sheet))
 
@@ -203,7 +203,7 @@ def test_parameters_without_a_positive_energy_are_refused(changes, message):
     material = dc.Material(**WOVEN | {"bending_twill": 6e-6})
     other = dc.Cloth.grid(3, 3, pose=[0, 0, 1, 1, 0, 0, 0], material=dc.Material(bending=1e-4))
     sim = dc.Simulator(dc.Scene([cloth(material), other]), 0.01)
-    changed = sim.parameters().replace(**changes)
+    changed = sim.default_parameters().replace(**changes)
     with pytest.raises(dc.InvalidInput, match=f"^step: {message}"):
         sim.step(sim.initial_state(), None, changed)
 

@@ -37,13 +37,13 @@ def rollout(sim, parameters, steps=12):
 def complete(sim, parameters):
     """Parameters of the scene with those of a fit in their places."""
     given = {n: v for n, v in vars(parameters).items() if isinstance(v, torch.Tensor)}
-    return sim.parameters().replace(**given)
+    return sim.default_parameters().replace(**given)
 
 
 def observe(sim, seed, noise=NOISE, **truth):
     numbers = {name: torch.tensor(value, dtype=F64) for name, value in truth.items()}
     with torch.no_grad():
-        states = rollout(sim, sim.parameters().replace(**numbers))
+        states = rollout(sim, sim.default_parameters().replace(**numbers))
     positions = torch.stack([state.positions for state in states]).numpy()
     return positions + noise * np.random.default_rng(seed).standard_normal(positions.shape)
 
@@ -154,7 +154,7 @@ def test_values_of_starts_and_several_trajectories(strip):
         moving = torch.ones_like(start.velocities)
         moving[:6] = 0.0
         start = start.replace(velocities=sign * moving * velocity)
-        given = sim.parameters().replace(bending=bending)
+        given = sim.default_parameters().replace(bending=bending)
         return sim.rollout(start, parameters=given, steps=4)
 
     bending = torch.tensor(3e-4, dtype=F64)
@@ -235,7 +235,7 @@ def test_a_failure_at_every_start_is_raised(strip):
 
 class TestResiduals:
     def test_markers_that_were_not_seen_do_not_count(self, strip):
-        states = rollout(strip, strip.parameters())
+        states = rollout(strip, strip.default_parameters())
         seen = torch.stack([s.positions for s in states]).detach().numpy()[:, [5, 9]] + 0.002
         seen[1, 0] = np.nan
         found = dc.residuals.markers(states, seen, vertices=[5, 9], noise=0.001)
@@ -245,7 +245,7 @@ class TestResiduals:
         assert float(weighted.abs().max()) == pytest.approx(0.001)
 
     def test_points_look_for_the_nearest_vertex(self, strip):
-        states = rollout(strip, strip.parameters())[:2]
+        states = rollout(strip, strip.default_parameters())[:2]
         clouds = [s.positions.detach().numpy()[[7, 3, 11]] + 1e-4 for s in states]
         found = dc.residuals.point_cloud(states, clouds, noise=1e-4)
         np.testing.assert_allclose(found.numpy(), -np.ones(18), atol=1e-9)
@@ -279,7 +279,7 @@ class TestResiduals:
         ],
     )
     def test_bad_input(self, strip, call, message):
-        states = rollout(strip, strip.parameters())
+        states = rollout(strip, strip.default_parameters())
         with pytest.raises(dc.InvalidInput, match=message):
             call(states)
 

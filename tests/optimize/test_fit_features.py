@@ -371,7 +371,7 @@ def test_the_page_of_a_fit_is_one_file_that_loads_nothing(tmp_path):
     simulator = dc.Simulator(dc.Scene([cloth]), 0.02)
 
     def simulate(stretch, bending):
-        given = simulator.parameters().replace(stretch=stretch, bending=bending)
+        given = simulator.default_parameters().replace(stretch=stretch, bending=bending)
         return simulator.rollout(simulator.initial_state(), parameters=given, steps=4)
 
     with torch.no_grad():

@@ -97,7 +97,7 @@ def woven(twill):
     start = sim.initial_state()
 
     def residuals(parameters):
-        given = sim.parameters().replace(bending_twill=parameters.bending_twill)
+        given = sim.default_parameters().replace(bending_twill=parameters.bending_twill)
         state = sim.step(start, parameters=given)
         return 10 * (parameters.bending_twill / 1.5e-4).log().reshape(1) + 0 * state.positions[0, 0]
 

@@ -46,7 +46,7 @@ def step(sim, state):
     before = state.detach()
     leaves = [before.positions.clone(), before.velocities.clone(), before.body_poses.clone()]
     x, v, poses = (leaf.requires_grad_() for leaf in leaves)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     friction = parameters.friction.clone().requires_grad_()
     after = sim.step(
         before.replace(positions=x, velocities=v, body_poses=poses),

@@ -171,7 +171,7 @@ def test_environments_have_a_wind_and_drag_of_their_own(scheme):
     sim = simulator(sheet(rotation((1, 0, 0), 0.3)), solver=(scheme, None, "newton"))
     winds = tensor([[3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-1.0, 2.0, 4.0]])
     drags = tensor([1.0, 0.0, 2.0])
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     batch, alone = sim.initial_state(3), [sim.initial_state()] * 3
     for _ in range(3):
         batch = sim.step(batch, sim.control(wind=winds), parameters.replace(normal_drag=drags))
@@ -250,7 +250,7 @@ def test_gradients_of_wind_and_coefficients_pass_gradcheck():
     start = sim.initial_state()
 
     def outputs(winds, normal, tangential, density):
-        parameters = sim.parameters().replace(
+        parameters = sim.default_parameters().replace(
             normal_drag=normal, tangential_drag=tangential, air_density=density
         )
         state = start

@@ -229,7 +229,7 @@ def test_a_kinematic_hand_carries_what_it_holds_and_lets_go():
 def test_the_parameters_of_a_scene_without_contact_can_be_given_back():
     """No pair touches: the stiffness of the barrier has no meaning, but is one that is accepted."""
     sim = sewn_to_box()
-    state, parameters = sim.initial_state(), sim.parameters()
+    state, parameters = sim.initial_state(), sim.default_parameters()
     assert parameters.barrier_stiffness > 0.0
     after = sim.step(state, None, parameters)
     assert torch.equal(after.positions, sim.step(state).positions)

@@ -40,7 +40,7 @@ def simulator(cloths, bodies=(), robots=(), dt=DT, coupling="monolithic", scheme
 def pairs(sim):
     """The default of each pair of surfaces by their names."""
     count = len(sim.surfaces)
-    values = sim.parameters().barrier_stiffness.expand(count, count)
+    values = sim.default_parameters().barrier_stiffness.expand(count, count)
     return {
         (a, b): values[i, j].item()
         for i, a in enumerate(sim.surfaces)
@@ -91,7 +91,7 @@ def test_a_body_far_away_changes_no_default(name, mass):
 def test_the_default_of_one_cloth_is_one_number_as_before():
     """To the last digit that rounding leaves; the share of bending is 1e-6 of it."""
     sim = simulator([sheet(8, density=0.2, stretch=700.0, bending=2e-5)], [FLOOR])
-    stiffness = sim.parameters().barrier_stiffness
+    stiffness = sim.default_parameters().barrier_stiffness
     assert stiffness.shape == ()
     assert stiffness.item() == pytest.approx(3718.8886128683357, rel=1e-12)
 
@@ -155,7 +155,7 @@ def test_a_heavy_box_lands_beside_a_cloth():
     sim = simulator([cloth], [FLOOR, box(100.0, 0.5, 0.0, 0.2, name="box")])
     state = rolled(sim, 60)[-1]
     assert (state.positions - alone.positions).abs().max() < 1e-6
-    reach = sim.parameters().barrier_distance.item()
+    reach = sim.default_parameters().barrier_distance.item()
     # Corners and the ridges between them share the weight: a little above one half.
     assert 0.45 * reach < state.body_poses[1, 2] - 0.05 < 0.8 * reach
     wrenches = sim.contact_wrenches(state)
@@ -234,7 +234,7 @@ def test_the_length_of_a_spring_and_where_a_scene_is_are_no_matter(width, shift)
         seam = dc.Attachment(("cloth0", edge), ("cloth1", edge), **length)
         hook = dc.Attachment(("body0", [0, 0, 0.05]), ("cloth0", [14]), **length)
         scene = dc.Scene([front, back], [ball], attachments=[seam, hook])
-        return dc.Simulator(scene, DT).parameters().barrier_stiffness
+        return dc.Simulator(scene, DT).default_parameters().barrier_stiffness
 
     without = defaults(0.0, 0.0)
     assert (without > 1e3).all()
@@ -291,7 +291,7 @@ def test_a_cloth_lies_between_a_floor_and_a_box(mass):
     """The floor and the cloth do not know what lies on it: the gap shrinks, and holds."""
     sim = simulator([sheet(9, 0.01)], [FLOOR, box(mass, 0, 0, 0.08, name="box")])
     state = rolled(sim, 80)[-1]
-    assert state.positions[:, 2].min() > 0.01 * sim.parameters().barrier_distance
+    assert state.positions[:, 2].min() > 0.01 * sim.default_parameters().barrier_distance
     wrenches = sim.contact_wrenches(state)
     cloth = sim.vertex_masses().sum().item()
     assert wrenches["box"][2] == pytest.approx(mass * G, rel=1e-3)
@@ -353,7 +353,7 @@ def test_one_number_is_the_same_for_every_pair(scheme, coupling):
     """Bit for bit, and its gradient is the sum of theirs."""
     sim = several(scheme, coupling, barrier_stiffness=1500.0)
     count = len(sim.surfaces)
-    given = sim.parameters()
+    given = sim.default_parameters()
     assert given.barrier_stiffness.shape == ()
     state = rolled(sim, round(0.06 / sim.dt))[-1]
     found = [
@@ -378,34 +378,36 @@ def test_one_number_is_the_same_for_every_pair(scheme, coupling):
 def test_a_batch_has_a_number_or_numbers_for_each_environment():
     sim = several()
     count = len(sim.surfaces)
-    default = sim.parameters().barrier_stiffness
+    default = sim.default_parameters().barrier_stiffness
     state = rolled(sim, 6)[-1]
     batch = dc.stack([state, state])
     numbers = torch.tensor([700.0, 4e3], dtype=F64)
     matrices = torch.stack([default, 2.0 * default])
     for values in (numbers, matrices):
-        end = sim.step(batch, None, sim.parameters().replace(barrier_stiffness=values))
+        end = sim.step(batch, None, sim.default_parameters().replace(barrier_stiffness=values))
         for k in range(2):
-            parameters = sim.parameters().replace(barrier_stiffness=values[k])
+            parameters = sim.default_parameters().replace(barrier_stiffness=values[k])
             assert torch.equal(end.positions[k], sim.step(state, None, parameters).positions)
     assert default.shape == (count, count)
-    wrong = sim.parameters().replace(barrier_stiffness=torch.ones(count, dtype=F64))
+    wrong = sim.default_parameters().replace(barrier_stiffness=torch.ones(count, dtype=F64))
     with pytest.raises(dc.InvalidInput, match=rf"\[\] or \[{count}, {count}\]"):
         sim.step(state, None, wrong)
     wrong = default.clone()
     wrong[1, 2] = 0.0
     with pytest.raises(dc.InvalidInput, match=r"`parameters\.barrier_stiffness` must .*> 0, got 0"):
-        sim.step(state, None, sim.parameters().replace(barrier_stiffness=wrong))
+        sim.step(state, None, sim.default_parameters().replace(barrier_stiffness=wrong))
 
 
 def test_a_pair_uses_the_mean_of_its_two_entries_and_no_other():
     sim = several()
     state = rolled(sim, 6)[-1]
-    default = sim.parameters().barrier_stiffness
+    default = sim.default_parameters().barrier_stiffness
     surfaces = list(sim.surfaces)
 
     def end(values):
-        return sim.step(state, None, sim.parameters().replace(barrier_stiffness=values)).positions
+        return sim.step(
+            state, None, sim.default_parameters().replace(barrier_stiffness=values)
+        ).positions
 
     a, b = surfaces.index("cloth0"), surfaces.index("cloth1")
     one_sided = default.clone()
@@ -438,5 +440,5 @@ def test_defaults_do_not_know_the_unit_of_length(unit):
         )
 
     # Of N/m^2, of which N has one length: 1/length.
-    expected, found = scene(1.0).parameters(), scene(unit).parameters()
+    expected, found = scene(1.0).default_parameters(), scene(unit).default_parameters()
     assert torch.equal(found.barrier_stiffness * unit, expected.barrier_stiffness)

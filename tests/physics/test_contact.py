@@ -59,7 +59,7 @@ def test_a_cloth_drapes_over_a_ball_without_intersections(scheme, thickness):
         state = sim.step(state)
         assert judge.is_free(state)
         if state.report.contact_count:
-            reach = thickness + sim.parameters().barrier_distance
+            reach = thickness + sim.default_parameters().barrier_distance
             assert state.report.minimum_distance < reach
             assert state.report.minimum_distance > (0.5 * thickness if thickness else 0.0)
         contacts = max(contacts, state.report.contact_count)

@@ -41,7 +41,7 @@ def patch_on_a_plane(mu, *, incline=0.0, plane=4.0, dt=0.01, slip_velocity=1e-3,
 def test_a_sheet_sticks_to_an_incline_up_to_its_friction_angle(mu, scheme, degrees):
     incline = np.arctan(mu) + np.radians(degrees)
     sim, state, along, _ = patch_on_a_plane(mu, incline=incline, dt=0.02, scheme=scheme)
-    weight = sim.parameters().replace(gravity=torch.tensor([0, 0, -G], dtype=F64))
+    weight = sim.default_parameters().replace(gravity=torch.tensor([0, 0, -G], dtype=F64))
     for _ in range(15):
         state = sim.step(state, None, weight)
     speed = (state.velocities @ along).mean().item()
@@ -57,7 +57,7 @@ def test_a_sliding_sheet_accelerates_as_coulomb_says():
     sim, state, along, _ = patch_on_a_plane(
         0.49, incline=np.arctan(0.5), dt=0.02, slip_velocity=1e-4
     )
-    weight = sim.parameters().replace(gravity=torch.tensor([0, 0, -G], dtype=F64))
+    weight = sim.default_parameters().replace(gravity=torch.tensor([0, 0, -G], dtype=F64))
     speeds = []
     for _ in range(20):
         state = sim.step(state, None, weight)
@@ -67,7 +67,7 @@ def test_a_sliding_sheet_accelerates_as_coulomb_says():
 
 def slide_to_rest(sim, state, v_0, mu, steps):
     v = v_0 * tensor([1.0, 0.0, 0.0]).expand_as(state.velocities)
-    parameters = sim.parameters().replace(friction=mu)
+    parameters = sim.default_parameters().replace(friction=mu)
     start = state.positions[:, 0].mean().item()
     state = state.replace(velocities=v)
     for _ in range(steps):

@@ -90,9 +90,9 @@ def test_it_has_the_contact_and_the_gradient_of_newton():
         velocities = torch.zeros_like(state.velocities)
         velocities[:, 0], velocities[:, 2] = 0.5, -0.5
         x, v = state.positions.clone().requires_grad_(), velocities.requires_grad_()
-        stretch = sim.parameters().stretch.clone().requires_grad_()
-        density = sim.parameters().density.clone().requires_grad_()
-        parameters = sim.parameters().replace(stretch=stretch, density=density)
+        stretch = sim.default_parameters().stretch.clone().requires_grad_()
+        density = sim.default_parameters().density.clone().requires_grad_()
+        parameters = sim.default_parameters().replace(stretch=stretch, density=density)
         after = state.replace(positions=x, velocities=v)
         for _ in range(3):
             after = sim.step(after, parameters=parameters)
@@ -109,7 +109,7 @@ def test_parameters_and_history_leave_no_trace():
     sim = simulator(SCENES["patch"](), "projective")
     state, control = shaken(sim)
     once = sim.step(state, control).positions
-    stiffer = sim.parameters().replace(stretch=sim.parameters().stretch * 2)
+    stiffer = sim.default_parameters().replace(stretch=sim.default_parameters().stretch * 2)
     assert not torch.equal(sim.step(state, control, stiffer).positions, once)
     batch = sim.step(dc.stack([state] * 3), dc.Control(pins=control.pins.expand(3, -1, -1)))
     assert torch.equal(sim.step(state, control).positions, once)

@@ -146,7 +146,7 @@ def slide(body, v_0=10.0, mu=0.5, h=0.01):
     start = state.positions[:, 0].mean().item()
     speed = torch.tensor(v_0, dtype=F64, requires_grad=True)
     friction = torch.tensor(mu, dtype=F64, requires_grad=True)
-    parameters = sim.parameters().replace(friction=friction)
+    parameters = sim.default_parameters().replace(friction=friction)
     throw = speed * tensor([1.0, 0.0, 0.0]).expand_as(state.velocities)
     state = state.replace(velocities=throw)
     for _ in range(round(v_0 / (mu * G) / h) + 5):

@@ -74,6 +74,14 @@ def moved(sim, batch_size=None, seed=0):
 # --- Energy --------------------------------------------------------------------------------------
 
 
+def test_energy_takes_parameters_in_the_place_that_they_had_in_0_1():
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid((3, 3), 0.1)]), 0.01)
+    state, heavy = sim.initial_state(), sim.default_parameters().replace(density=3.0)
+    with pytest.warns(FutureWarning, match=r"energy: the order is \(state, control, parameters\)"):
+        before = sim.energy(state, heavy)
+    assert torch.equal(before, sim.energy(state, None, heavy))
+
+
 def test_the_parts_of_the_energy_add_up_to_it(sim):
     state = moved(sim)
     parts = sim.energy(state, parts=True)
@@ -100,7 +108,7 @@ def test_each_part_is_what_its_name_says():
     start = sim.initial_state()
     factor = torch.tensor([1.1, 1.0, 1.0], dtype=F64)
     parts = sim.energy(start.replace(positions=factor * start.positions), parts=True)
-    given = sim.parameters()
+    given = sim.default_parameters()
     # 1/2 k_s (s - 1)^2 of the area; 1/2 k |x - c|^2 of each pin.
     assert parts["stretch"].item() == pytest.approx(0.5 * 550 * 0.1**2 * 0.2**2, rel=1e-12)
     pulled = ((factor - 1) * start.positions).square().sum().item()
@@ -114,7 +122,9 @@ def test_each_part_is_what_its_name_says():
     twice = given.replace(barrier_stiffness=2 * given.barrier_stiffness)
     barrier = sim.energy(start, parts=True)["contact"].item()
     assert barrier > 0
-    assert sim.energy(start, twice, parts=True)["contact"].item() == pytest.approx(2 * barrier)
+    assert sim.energy(start, parameters=twice, parts=True)["contact"].item() == pytest.approx(
+        2 * barrier
+    )
 
 
 def test_a_control_moves_the_soft_pins_and_their_energy():
@@ -133,8 +143,8 @@ def test_bending_is_a_part_of_its_own():
     flat = sim.initial_state().positions
     wave = flat + torch.tensor([0, 0, 1e-4], dtype=F64) * torch.cos(20 * flat[:, :1])
     state = sim.initial_state().replace(positions=wave)
-    stiffer = sim.parameters().replace(bending=3e-3)
-    once, thrice = sim.energy(state, parts=True), sim.energy(state, stiffer, parts=True)
+    stiffer = sim.default_parameters().replace(bending=3e-3)
+    once, thrice = sim.energy(state, parts=True), sim.energy(state, parameters=stiffer, parts=True)
     assert thrice["bending"].item() == pytest.approx(3 * once["bending"].item(), rel=1e-12)
     assert once["bending"] > 0
     assert thrice["stretch"] == once["stretch"]
@@ -151,7 +161,7 @@ def test_gravity_of_the_energy_is_that_of_everything_with_mass(sim):
     for name, mass in (
         ("positions", sim.vertex_masses().sum()),
         ("body_poses", 0.5),
-        ("base_poses", sim.parameters().link_mass.sum()),
+        ("base_poses", sim.default_parameters().link_mass.sum()),
     ):
         higher = state.replace(**{name: up.get(name, state.positions + lift)})
         change = (
@@ -179,14 +189,14 @@ def test_vertex_masses_are_a_third_of_those_of_the_faces(sim):
 
 
 def test_vertex_masses_follow_the_parameters(sim):
-    rest = sim.parameters().rest_positions
+    rest = sim.default_parameters().rest_positions
     faces = sum(len(cloth.faces) for cloth in sim.scene.cloths)
     density = torch.linspace(0.1, 0.4, faces, dtype=F64)
-    wider = sim.parameters().replace(density=density, rest_positions=2 * rest)
+    wider = sim.default_parameters().replace(density=density, rest_positions=2 * rest)
     heavier = sim.vertex_masses(wider)
-    narrow = sim.vertex_masses(sim.parameters().replace(density=density))
+    narrow = sim.vertex_masses(sim.default_parameters().replace(density=density))
     torch.testing.assert_close(heavier, 4 * narrow, rtol=1e-13, atol=0)
-    both = sim.parameters().replace(density=torch.stack([density, 3 * density]))
+    both = sim.default_parameters().replace(density=torch.stack([density, 3 * density]))
     masses = sim.vertex_masses(both, batch_size=2)
     torch.testing.assert_close(masses, torch.stack([narrow, 3 * narrow]), rtol=1e-13, atol=0)
     assert sim.vertex_masses(batch_size=3).shape == (3, 25)
@@ -251,7 +261,7 @@ def test_a_pendulum_by_hand(tmp_path):
     np.testing.assert_allclose(sim.momentum(state), expected, rtol=1e-12, atol=1e-14)
     energy = 0.5 * (2 * speed**2 + 0.03 * 9)
     assert sim.kinetic_energy(state).item() == pytest.approx(energy, rel=1e-12)
-    geared = sim.parameters().replace(joint_armature=tensor([0.1]))
+    geared = sim.default_parameters().replace(joint_armature=tensor([0.1]))
     drive = sim.kinetic_energy(state, geared) - sim.kinetic_energy(state)
     assert drive.item() == pytest.approx(0.5 * 0.1 * 9, rel=1e-12)
     assert torch.equal(sim.momentum(state, geared), sim.momentum(state))
@@ -277,7 +287,7 @@ def test_a_base_that_is_fixed_has_no_velocity(tmp_path):
 def test_drives_of_prescribed_joints_have_no_inertia(sim):
     """They are part of what prescribes them: the first finger's position is, the second's not."""
     state = moved(sim)
-    geared = sim.parameters().replace(joint_armature=tensor([0.1, 0.2]))
+    geared = sim.default_parameters().replace(joint_armature=tensor([0.1, 0.2]))
     drives = sim.kinetic_energy(state, geared) - sim.kinetic_energy(state)
     expected = 0.5 * 0.2 * state.joint_velocities[1] ** 2
     # The difference of two energies, of some ten times its size.
@@ -316,11 +326,11 @@ def test_momentum_is_the_rate_of_the_moments_of_mass(sim):
 
     def first_moment(sign):
         there = advanced(sim, state, sign * step)
-        weight = [sim.energy(there, heavy(axis), parts=True)["gravity"] for axis in range(3)]
+        weight = [sim.energy(there, None, heavy(axis), parts=True)["gravity"] for axis in range(3)]
         return -torch.stack(weight)
 
     def heavy(axis):
-        return sim.parameters().replace(gravity=torch.eye(3, dtype=F64)[axis])
+        return sim.default_parameters().replace(gravity=torch.eye(3, dtype=F64)[axis])
 
     rate = (first_moment(1) - first_moment(-1)) / (2 * step)
     # Differences of energies of some 10 J over 2e-6 s.
@@ -348,7 +358,7 @@ def advanced(sim, state, time):
         turn = 2 * torch.linalg.cross(q[:, 1:], x)
         return x + q[:, :1] * turn + torch.linalg.cross(q[:, 1:], turn)
 
-    given = sim.parameters()
+    given = sim.default_parameters()
     root = sim.scene.robots[0].mechanism.root
     return state.replace(
         positions=state.positions + time * state.velocities,
@@ -414,7 +424,7 @@ def test_a_free_scene_keeps_its_momentum():
 )
 def test_gradients_are_those_of_differences(sim, name):
     """Of a weighted sum of momentum and kinetic energy."""
-    state, given = moved(sim), sim.parameters().replace(joint_armature=tensor([0.1, 0.2]))
+    state, given = moved(sim), sim.default_parameters().replace(joint_armature=tensor([0.1, 0.2]))
     weights = scenes.tensor_noise((6,), 1.0, 7)
     of_state = hasattr(state, name)
     at = getattr(state if of_state else given, name)

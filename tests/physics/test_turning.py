@@ -196,7 +196,7 @@ def test_gradients_of_a_grip_that_turns_are_those_of_differences(turn):
         """Two steps; theta: the turn in each, a shift of the plate [mm] and the friction."""
         state = start.detach()
         pose = start.body_poses[0].detach()
-        given = sim.parameters()
+        given = sim.default_parameters()
         given = given.replace(friction=theta[2] * torch.ones_like(given.friction))
         for k in (1, 2):
             half = 0.5 * k * theta[0]
@@ -285,7 +285,7 @@ def test_friction_about_a_body_that_spins_is_that_of_its_radius(smooth, turn):
     velocities = torch.zeros_like(state.body_velocities)
     velocities[0] = tensor([0, 0, -0.3, 0, turn / dt, 0])
     state = state.replace(body_velocities=velocities)
-    masses = sim.parameters().body_mass[:, None]
+    masses = sim.default_parameters().body_mass[:, None]
     created, taken = torch.zeros(3, dtype=F64), 0.0
     for _ in range(4):
         after = sim.step(state)

@@ -43,7 +43,7 @@ class Step:
         return self.sim.step(
             self.state.replace(**parts["state"]),
             dc.Control(**parts["control"]),
-            self.sim.parameters().replace(**parts["parameters"]),
+            self.sim.default_parameters().replace(**parts["parameters"]),
         )
 
 
@@ -95,7 +95,7 @@ def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, dr
     }
     # Thickness only decides which vertices touch.
     left_out = {"thickness"} if drag else {"thickness", *AIR}
-    for name, value in vars(sim.parameters()).items():
+    for name, value in vars(sim.default_parameters()).items():
         if isinstance(value, torch.Tensor) and name not in left_out:
             inputs[f"parameters.{name}"] = value
     return Step(sim, state, inputs)
@@ -122,7 +122,7 @@ def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
     state = state.replace(velocities=velocities)
     inputs = {"state.positions": state.positions, "state.velocities": state.velocities}
     for name in ("friction", "stretch", "density", "damping", "rest_positions"):
-        inputs[f"parameters.{name}"] = getattr(sim.parameters(), name)
+        inputs[f"parameters.{name}"] = getattr(sim.default_parameters(), name)
     return Step(sim, state, inputs)
 
 

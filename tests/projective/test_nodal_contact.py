@@ -77,8 +77,12 @@ def test_forces_change_the_momentum(case, scheme):
     after, sim = step(), step.sim
     masses = sim.vertex_masses()[:, None]
     change = (masses * (after.velocities - step.state.velocities)).sum(0) / DT
-    spring = sim.parameters().pin_stiffness * (after.soft_pin_targets[0] - after.positions[35])
-    given = (masses * sim.parameters().gravity + step.inputs["control.forces"]).sum(0) + spring
+    spring = sim.default_parameters().pin_stiffness * (
+        after.soft_pin_targets[0] - after.positions[35]
+    )
+    given = (masses * sim.default_parameters().gravity + step.inputs["control.forces"]).sum(
+        0
+    ) + spring
     total = given + after.contact_forces.sum(0) + after.pin_forces.sum(0)
     torch.testing.assert_close(change, total, rtol=1e-7, atol=1e-7)
     on_all = after.contact_forces.sum(0) + after.body_forces.sum(0)
@@ -207,7 +211,7 @@ def test_what_hardly_slips_is_hardly_moved_across(excess):
     h, mu = 0.01, 0.5
     sim, state, _ = patch(mu, dt=h)
     # Soft: the size of a slip is then told by masses alone.
-    given = sim.parameters().replace(
+    given = sim.default_parameters().replace(
         stretch=torch.tensor(0.01, dtype=F64), bending=torch.tensor(1e-8, dtype=F64)
     )
     pull = mu / (1 - excess) * 5.0
@@ -228,7 +232,7 @@ def test_stopping_distance_and_its_gradients(v_0, mu):
     direction = torch.tensor([1.0, 0.0, 0.0], dtype=F64)
     x = state.positions
     state = state.replace(velocities=speed * direction.expand_as(x))
-    parameters = sim.parameters().replace(friction=friction)
+    parameters = sim.default_parameters().replace(friction=friction)
     steps = int(v_0 / (mu * G * h))
     for _ in range(steps + 3):
         state = sim.step(state, None, parameters)
@@ -272,7 +276,7 @@ def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
     sim = dc.Simulator(dc.Scene([sheet], [floor]), DT, scheme="projective")
     state = sim.step(sim.initial_state())
     assert counts(state)[1] == 9
-    weight = sim.parameters().density * 0.1 * 0.1 * G
+    weight = sim.default_parameters().density * 0.1 * 0.1 * G
     force = state.body_forces[:, 2]
     torch.testing.assert_close(force.sum(), -weight, rtol=1e-6, atol=0)
     points = state.positions.clamp(-0.5, 0.5)
@@ -303,7 +307,7 @@ def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
     one, other = after.velocities[9 * thick :][:9], after.velocities[9 * (1 - thick) :][:9]
     assert one[:, 2].abs().max() < 1e-9
     torch.testing.assert_close(other[:, 2], torch.full((9,), -0.1 - DT * G, dtype=F64))
-    friction = sim.parameters().friction[thick, 2]
+    friction = sim.default_parameters().friction[thick, 2]
     torch.testing.assert_close(one[:, 0], (1.0 - friction * (0.1 + DT * G)).expand(9))
 
 
@@ -417,7 +421,7 @@ def test_split_leaves_nodal_bodies_out_of_the_barrier():
     after = step()
     assert counts(after)[2] > 0
     assert after.report.contact_count == 0
-    assert step.sim.parameters().barrier_distance is None
+    assert step.sim.default_parameters().barrier_distance is None
 
 
 @pytest.mark.parametrize("metric", ["energy", "elastic"])
@@ -444,7 +448,7 @@ def test_gradients_of_nodes_and_barrier_in_one_step_are_those_of_differences(met
         velocities=step.state.velocities,
         soft_pin_targets=step.state.soft_pin_targets,
     )
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     after = sim.step(state)
     assert sum(counts(after)) > 0
     assert after.report.contact_count > 0

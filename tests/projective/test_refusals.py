@@ -63,7 +63,7 @@ def test_coupled_has_no_contact_at_nodes():
 
 def test_projective_has_no_barrier():
     sim = simulator(lambda **k: dc.RigidBody.box(0.1, **k), "projective")
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     for name in ("barrier_distance", "barrier_stiffness", "slip_velocity"):
         assert getattr(parameters, name) is None
         with pytest.raises(dc.InvalidInput, match=name):

@@ -10,10 +10,10 @@ import diffcloth_torch as dc
 
 
 def momentum(step, state):
-    density = step.sim.parameters().density
+    density = step.sim.default_parameters().density
     triangles = torch.cat([torch.from_numpy(np.array(c.faces)) for c in step.sim.scene.cloths])
     triangles[len(triangles) // 2 :] += 25
-    rest = step.sim.parameters().rest_positions
+    rest = step.sim.default_parameters().rest_positions
     a, b, c = (rest[triangles[:, k]] for k in range(3))
     masses = torch.zeros(50, dtype=F64)
     share = density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6

@@ -91,10 +91,10 @@ def gradients_of(sim, state, drag):
     """Check those of drag, and of what its weights and its motion follow from."""
 
     def step(drag, rest_positions, positions):
-        parameters = sim.parameters().replace(drag=drag, rest_positions=rest_positions)
+        parameters = sim.default_parameters().replace(drag=drag, rest_positions=rest_positions)
         return sim.step(state.replace(positions=positions), None, parameters)
 
-    rest = sim.parameters().rest_positions
+    rest = sim.default_parameters().rest_positions
     given = {"drag": drag, "rest_positions": rest, "positions": state.positions}
     check_gradients(step, given, {"drag": 0.02, "rest_positions": 1e-6, "positions": 1e-6})
 
@@ -111,7 +111,7 @@ def test_the_tangents_are_the_transpose_of_the_gradients(solver):
     sim, state = sheet(*solver)
     drag = per_face(len(sim.scene.cloths[0].faces))
     core, inputs = inputs_of(
-        sim, lambda: sim.step(state, None, sim.parameters().replace(drag=drag))
+        sim, lambda: sim.step(state, None, sim.default_parameters().replace(drag=drag))
     )
     assert {"drag", "rest_positions"} <= set(inputs)
     assert {"positions", "velocities"} <= check_pairs(core, inputs, core.forward(inputs, True, 1))
@@ -151,9 +151,9 @@ def test_a_scene_without_cloths_needs_none():
     box = dc.RigidBody.box(0.1, motion="dynamic", mass=0.2)
     contact = dc.ContactOptions(barrier_distance=0.01)
     sim = dc.Simulator(dc.Scene([], [box]), 0.01, contact=contact)
-    assert sim.parameters().drag is None
-    gravity = sim.parameters().gravity.clone().requires_grad_()
-    after = sim.step(sim.initial_state(), None, sim.parameters().replace(gravity=gravity))
+    assert sim.default_parameters().drag is None
+    gravity = sim.default_parameters().gravity.clone().requires_grad_()
+    after = sim.step(sim.initial_state(), None, sim.default_parameters().replace(gravity=gravity))
     (gradient,) = torch.autograd.grad(after.body_velocities[0, 2], [gravity])
     torch.testing.assert_close(gradient, torch.tensor([0, 0, sim.dt], dtype=F64))
 

@@ -163,7 +163,7 @@ def folder(tmp_path_factory):
 def test_gradients_of_steps_in_contact(folder, actuation, name):
     sim, start = scene(folder, actuation)
     of_state = name not in ("link_mass", "link_center", "link_inertia")
-    given = getattr(start if of_state else sim.parameters(), name).detach()
+    given = getattr(start if of_state else sim.default_parameters(), name).detach()
     weights = torch.Generator().manual_seed(1)
     weights = [
         torch.randn(getattr(start, field).shape, dtype=F64, generator=weights)
@@ -171,7 +171,7 @@ def test_gradients_of_steps_in_contact(folder, actuation, name):
     ]
 
     def loss(value):
-        state, parameters = start, sim.parameters()
+        state, parameters = start, sim.default_parameters()
         if of_state:
             state = state.replace(**{name: value})
         else:

@@ -20,12 +20,12 @@ def falling_box():
 
 
 def test_defaults_come_from_materials_and_the_scene():
-    parameters = dc.Simulator(dc.Scene([sheet(dc.Material())]), 0.01).parameters()
+    parameters = dc.Simulator(dc.Scene([sheet(dc.Material())]), 0.01).default_parameters()
     assert (parameters.normal_drag, parameters.tangential_drag) == (0.0, 0.0)
     assert parameters.air_density == 1.2
     per_face = dc.Material(normal_drag=np.linspace(0.0, 1.0, 8))
     scene = dc.Scene([sheet(per_face), sheet(pose=[0, 0, 1, 1, 0, 0, 0])], air_density=0.9)
-    parameters = dc.Simulator(scene, 0.01).parameters()
+    parameters = dc.Simulator(scene, 0.01).default_parameters()
     assert parameters.normal_drag.tolist() == [*np.linspace(0.0, 1.0, 8), *[1.5] * 8]
     assert parameters.tangential_drag.tolist() == [0.0, 0.03]
     assert parameters.air_density == 0.9
@@ -39,8 +39,8 @@ def test_defaults_come_from_materials_and_the_scene():
 
 def test_a_scene_without_cloths_has_no_air():
     sim = dc.Simulator(falling_box(), 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
-    assert sim.parameters().air_density is None
-    assert sim.parameters().normal_drag is None
+    assert sim.default_parameters().air_density is None
+    assert sim.default_parameters().normal_drag is None
     state = sim.initial_state()
     with pytest.raises(
         dc.InvalidInput, match=r"^step: `control.wind` must be None: the scene has no"

@@ -111,11 +111,11 @@ def test_names_and_rows_are_those_of_the_attachments():
     ends = np.split(springs.coefficients, springs.start[1:-1])
     assert [e.sum() for e in ends] == pytest.approx([1, 1, 0, 0, 0, 0], abs=1e-15)
     sim = dc.Simulator(given, 0.01)
-    assert sim.parameters().attachment_stiffness.tolist() == [1, 2, 3, 4, 4, 4]
+    assert sim.default_parameters().attachment_stiffness.tolist() == [1, 2, 3, 4, 4, 4]
     stiffer = dc.Parameters(attachment_stiffness={"grasp": 7.0})
     sim.step(sim.initial_state(), None, stiffer)
     assert "attachments=" in repr(given)
-    assert dc.Simulator(dc.Scene([sheet()]), 0.01).parameters().attachment_stiffness is None
+    assert dc.Simulator(dc.Scene([sheet()]), 0.01).default_parameters().attachment_stiffness is None
 
 
 @pytest.fixture(scope="module")

@@ -291,15 +291,15 @@ def test_a_scene_of_micrometers_is_refused_with_a_tolerance_that_it_works_with()
     for _ in range(20):
         state = sim.step(state)
         assert state.report.converged
-    assert 0 < state.report.minimum_distance <= sim.parameters().barrier_distance
+    assert 0 < state.report.minimum_distance <= sim.default_parameters().barrier_distance
     assert (state.positions - sim.initial_state().positions)[..., :2].abs().max() < 1e-8
 
 
 def test_a_rest_shape_without_area_is_refused_in_every_environment(sim):
-    rest = sim.parameters().rest_positions.repeat(3, 1, 1)
+    rest = sim.default_parameters().rest_positions.repeat(3, 1, 1)
     rest[2, 0] = rest[2, 1]
     with pytest.raises(dc.InvalidInput, match="rest_positions"):
-        sim.step(sim.initial_state(3), None, sim.parameters().replace(rest_positions=rest))
+        sim.step(sim.initial_state(3), None, sim.default_parameters().replace(rest_positions=rest))
 
 
 def test_a_cloth_may_be_finer_than_a_body_is_thick():
@@ -320,5 +320,5 @@ def test_the_barrier_leaves_room_for_the_thickest_cloth():
         5, 5, material=dc.Material(thickness=0.4 * apart), pose=[0, 0, 5, 1, 0, 0, 0]
     )
     for cloths in ([thin, thick], [thick, thin]):
-        distance = dc.Simulator(dc.Scene(cloths), 0.01).parameters().barrier_distance
+        distance = dc.Simulator(dc.Scene(cloths), 0.01).default_parameters().barrier_distance
         assert distance.item() == pytest.approx(0.05 * apart, rel=1e-12)

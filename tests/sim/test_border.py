@@ -36,7 +36,7 @@ def sim():
 
 @pytest.fixture(scope="module")
 def inputs(sim):
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     stretched = parameters.replace(rest_positions=1.01 * parameters.rest_positions)
     tensors, _ = sim._inputs(sim.initial_state(), None, stretched)
     tensors["friction_origins"] = sim._engine.surfaces.vertices(vars(sim.initial_state()))[None]

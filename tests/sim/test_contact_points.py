@@ -76,10 +76,10 @@ def test_geometry_is_that_of_the_surfaces(step):
     way = contacts.points[:, 1] - contacts.points[:, 0]
     distance = way.norm(dim=-1)
     torch.testing.assert_close(way, distance[:, None] * contacts.normals, rtol=0, atol=1e-12)
-    thickness = sim.parameters().thickness[contacts.pairs].mean(dim=-1)
+    thickness = sim.default_parameters().thickness[contacts.pairs].mean(dim=-1)
     torch.testing.assert_close(contacts.gaps, distance - thickness, rtol=0, atol=1e-14)
     pressing = contacts.normal_forces != 0
-    assert (contacts.gaps[pressing] < sim.parameters().barrier_distance).all()
+    assert (contacts.gaps[pressing] < sim.default_parameters().barrier_distance).all()
     assert float(distance[pressing].min()) == pytest.approx(state.report.minimum_distance, rel=1e-9)
     along = (contacts.tangential_forces * contacts.normals).sum(dim=-1).abs()
     assert along.max() < 0.1 * contacts.forces.abs().max()  # of normals that are a solve old

@@ -183,11 +183,11 @@ def test_initial_state_has_the_shapes_of_the_scene(sim):
 
 def test_states_and_parameters_are_new_each_time(sim):
     sim.initial_state().positions.add_(1)
-    sim.parameters().stretch.add_(1)
+    sim.default_parameters().stretch.add_(1)
     np.testing.assert_array_equal(
         sim.initial_state().positions[:16].numpy(), sim.scene.cloths[0].vertices
     )
-    assert sim.parameters().stretch.item() == dc.Material().stretch
+    assert sim.default_parameters().stretch.item() == dc.Material().stretch
 
 
 def test_slices_give_the_rows_of_each_surface(sim):
@@ -201,8 +201,15 @@ def test_slices_give_the_rows_of_each_surface(sim):
     assert sim.joint_slices == {}
 
 
+def test_the_name_of_default_parameters_in_0_1_is_an_alias_that_warns(sim):
+    with pytest.warns(FutureWarning, match="its name is `default_parameters` since") as caught:
+        given = sim.parameters()
+    assert caught[0].filename == __file__
+    assert torch.equal(given.stretch, sim.default_parameters().stretch)
+
+
 def test_parameters_are_as_small_as_the_scene_allows(sim):
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     assert parameters.stretch.shape == ()
     assert parameters.thickness.shape == (4,)
     assert parameters.pin_stiffness.item() == 1e4
@@ -210,7 +217,7 @@ def test_parameters_are_as_small_as_the_scene_allows(sim):
     assert parameters.barrier_distance.shape == ()
     assert parameters.barrier_stiffness.shape == (4, 4)  # of two cloths that differ
     alone = dc.Simulator(dc.Scene(sim.scene.cloths[:1]), DT)
-    assert alone.parameters().barrier_stiffness.shape == ()
+    assert alone.default_parameters().barrier_stiffness.shape == ()
     assert parameters.slip_velocity.item() == 1e-5
     mixed = dc.Scene(
         [
@@ -218,7 +225,7 @@ def test_parameters_are_as_small_as_the_scene_allows(sim):
             dc.Cloth.grid(2, 2, material=dc.Material(stretch=2.0), pose=[0, 0, 1, 1, 0, 0, 0]),
         ]
     )
-    parameters = dc.Simulator(mixed, DT).parameters()
+    parameters = dc.Simulator(mixed, DT).default_parameters()
     assert parameters.stretch.tolist() == [1, 2]
     assert parameters.bending.tolist() == [1, 2, 1e-5, 1e-5]
 
@@ -226,14 +233,14 @@ def test_parameters_are_as_small_as_the_scene_allows(sim):
 def test_friction_of_a_pair_is_the_geometric_mean():
     cloth = dc.Cloth.grid(3, 3, material=dc.Material(friction=0.2), pose=[0, 0, 1, 1, 0, 0, 0])
     scene = dc.Scene([cloth], [dc.RigidBody.plane(1.0, friction=0.8)])
-    friction = dc.Simulator(scene, DT).parameters().friction
+    friction = dc.Simulator(scene, DT).default_parameters().friction
     torch.testing.assert_close(friction, torch.tensor([[0.2, 0.4], [0.4, 0.8]], dtype=F64))
 
 
 def test_parameters_that_the_scene_lacks_are_none_and_refused():
     cloth = dc.Cloth.grid(3, 3, bending_model="hinge")
     sim = dc.Simulator(dc.Scene([cloth]), DT, contact=dc.ContactOptions(self_contact=False))
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     for name in ("friction", "thickness", "barrier_distance", "barrier_stiffness", "slip_velocity"):
         assert getattr(parameters, name) is None
     assert parameters.pin_stiffness is None
@@ -248,8 +255,8 @@ def test_parameters_that_the_scene_lacks_are_none_and_refused():
 
 def test_the_default_barrier_follows_from_the_cloths_alone():
     cloth = dc.Cloth.grid(5, 5, pose=[0, 0, 1, 1, 0, 0, 0])
-    alone = dc.Simulator(dc.Scene([cloth]), DT).parameters()
-    floor = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.plane(100.0)]), DT).parameters()
+    alone = dc.Simulator(dc.Scene([cloth]), DT).default_parameters()
+    floor = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.plane(100.0)]), DT).default_parameters()
     assert torch.equal(alone.barrier_distance, floor.barrier_distance)
     # A tenth of the median edge: 0.25 m along the grid, of 56 edges only 16 are diagonal.
     assert alone.barrier_distance.item() == pytest.approx(0.025)
@@ -385,14 +392,14 @@ def test_a_bad_control_is_refused(sim, field, value, error, message):
     ],
 )
 def test_a_bad_parameter_is_refused(sim, field, value, message):
-    parameters = sim.parameters().replace(**{field: value})
+    parameters = sim.default_parameters().replace(**{field: value})
     with pytest.raises(dc.InvalidInput, match=message):
         sim.step(sim.initial_state(), None, parameters)
 
 
 def test_unknown_fields_are_refused(sim):
     with pytest.raises(dc.InvalidInput, match=r"fields are stretch, .*got 'stiffness'"):
-        sim.parameters().replace(stiffness=1.0)
+        sim.default_parameters().replace(stiffness=1.0)
     with pytest.raises(dc.InvalidInput, match=r"fields are pins, .*got 'force'"):
         sim.control().replace(force=1.0)
 
@@ -426,7 +433,7 @@ def test_every_way_to_pass_numbers_gives_the_same_bits(sim):
 def test_gradients_come_back_in_the_callers_dtype(sim):
     forces = torch.zeros(VERTICES, 3, dtype=torch.float32, requires_grad=True)
     gravity = torch.tensor([0, 0, -9.75], dtype=torch.bfloat16, requires_grad=True)
-    parameters = sim.parameters().replace(gravity=gravity)
+    parameters = sim.default_parameters().replace(gravity=gravity)
     sim.step(sim.initial_state(), dc.Control(forces=forces), parameters).positions.sum().backward()
     assert forces.grad.dtype == torch.float32
     assert gravity.grad.dtype == torch.bfloat16
@@ -495,7 +502,7 @@ def test_a_batch_gives_the_bits_of_its_environments(sim):
         3, VERTICES, 3, dtype=F64, generator=torch.Generator().manual_seed(0)
     )
     stretch = torch.tensor([500.0, 550.0, 600.0], dtype=F64)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     batch = sim.step(
         dc.stack(states), dc.Control(forces=forces), parameters.replace(stretch=stretch)
     )
@@ -522,7 +529,7 @@ def test_shared_inputs_get_the_sum_of_the_gradients(sim):
         gravity = torch.tensor([0, 0, -9.81], dtype=F64, requires_grad=True)
         pins = states[0].positions[PINS[2:3]].clone().requires_grad_()
         control = dc.Control(forces=forces, pins={"corner": pins})
-        after = sim.step(state, control, sim.parameters().replace(gravity=gravity))
+        after = sim.step(state, control, sim.default_parameters().replace(gravity=gravity))
         (after.positions**2).sum().backward()
         return forces.grad, gravity.grad, pins.grad
 
@@ -536,13 +543,13 @@ def test_batched_inputs_of_a_single_state_are_refused(sim):
     with pytest.raises(dc.InvalidInput, match=r"batch axis.*batch_size"):
         sim.step(state, dc.Control(forces=torch.zeros(2, VERTICES, 3)))
     with pytest.raises(dc.InvalidInput, match=r"batch.*batch_size"):
-        sim.step(state, None, sim.parameters().replace(gravity=torch.zeros(2, 3)))
+        sim.step(state, None, sim.default_parameters().replace(gravity=torch.zeros(2, 3)))
     with pytest.raises(dc.InvalidInput, match="2 environments, as the state, got"):
         sim.step(sim.initial_state(2), dc.Control(forces=torch.zeros(3, VERTICES, 3)))
 
 
 def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
-    state, parameters = sim.initial_state(2), sim.parameters()
+    state, parameters = sim.initial_state(2), sim.default_parameters()
     with pytest.raises(
         dc.InvalidInput, match=r"^step: `parameters\.stretch` of shape \[2\] could .*\[2, 2\]"
     ):
@@ -571,7 +578,7 @@ def test_the_simulators_own_parameters_are_never_ambiguous():
         for s in (1.0, 2.0)
     ]
     sim = dc.Simulator(dc.Scene(cloths), DT)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     assert parameters.stretch.shape == (2,)
     batch = sim.step(sim.initial_state(2), None, parameters.replace(density=0.2))
     assert same(batch[1], sim.step(sim.initial_state(), None, parameters.replace(density=0.2)))
@@ -649,7 +656,7 @@ def test_an_input_edited_in_place_makes_backward_raise(sim, field):
     state = moved(sim)
     velocities = state.velocities.clone()
     forces = torch.zeros(VERTICES, 3, dtype=F64)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     x = state.positions.clone().requires_grad_()
     after = sim.step(
         state.replace(positions=x, velocities=velocities), dc.Control(forces=forces), parameters
@@ -686,7 +693,7 @@ def differentiable(sim, batch_size=None):
     }
     parameters = {
         name: tensor.requires_grad_()
-        for name, tensor in vars(sim.parameters()).items()
+        for name, tensor in vars(sim.default_parameters()).items()
         if isinstance(tensor, torch.Tensor)
     }
     return state, leaf, control, parameters
@@ -698,7 +705,9 @@ def test_one_leaf_at_a_time_gets_the_gradient_of_all_together(sim, batch_size):
 
     def loss(leaf, control, parameters):
         after = sim.step(
-            state.replace(**leaf), dc.Control(**control), sim.parameters().replace(**parameters)
+            state.replace(**leaf),
+            dc.Control(**control),
+            sim.default_parameters().replace(**parameters),
         )
         return (after.positions**2).sum() + (after.velocities**2).sum() + after.body_forces.sum()
 
@@ -895,7 +904,7 @@ def test_checkpoints_change_no_bit(sim, every, callable_controls):
         states = sim.rollout(
             state.replace(positions=x),
             given,
-            sim.parameters().replace(gravity=gravity),
+            sim.default_parameters().replace(gravity=gravity),
             steps=5,
             checkpoint_every=checkpoint_every,
         )
@@ -928,7 +937,7 @@ def test_arrays_may_be_used_again_behind_a_checkpoint(sim):
 def test_an_edit_in_place_is_noticed_behind_a_checkpoint(sim):
     x = moved(sim).positions.requires_grad_()
     gravity = torch.tensor([0, 0, -9.81], dtype=F64)
-    parameters = sim.parameters().replace(gravity=gravity)
+    parameters = sim.default_parameters().replace(gravity=gravity)
     states = sim.rollout(
         moved(sim).replace(positions=x), None, parameters, steps=2, checkpoint_every=1
     )

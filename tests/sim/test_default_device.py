@@ -24,7 +24,7 @@ def simulated():
     box = dc.RigidBody.box(0.05, motion="dynamic", mass=0.1, pose=[0.3, 0, 0.4, 1, 0, 0, 0])
     scene = dc.Scene([cloth], [dc.RigidBody.box(0.2), box], robots=[hand])
     simulator = dc.Simulator(scene, 0.01)
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     given = given.replace(gravity=given.gravity.clone().requires_grad_())
     states = simulator.rollout(
         simulator.initial_state(2), parameters=given, steps=3, checkpoint_every=2

@@ -120,7 +120,7 @@ def case(name):
 
 def inputs(sim, state):
     """All tensors of a state and of parameters by their names."""
-    owners = {"state": state, "parameters": sim.parameters()}
+    owners = {"state": state, "parameters": sim.default_parameters()}
     return {
         f"{owner}.{name}": tensor.detach()
         for owner, record in owners.items()
@@ -136,7 +136,9 @@ def parts_of(sim, state, values):
         owner, field = name.split(".")
         own[owner][field] = tensor
     return sim.energy(
-        state.replace(**own["state"]), sim.parameters().replace(**own["parameters"]), parts=True
+        state.replace(**own["state"]),
+        parameters=sim.default_parameters().replace(**own["parameters"]),
+        parts=True,
     )
 
 
@@ -303,10 +305,12 @@ def test_a_batch_has_the_gradients_of_its_environments(name):
     states = [state, state.replace(positions=state.positions + noise)]
     names = ("state.positions", "state.body_poses", "parameters.barrier_stiffness")
     batch = dc.stack(states)
-    shared = sim.parameters().barrier_stiffness.clone().requires_grad_()
+    shared = sim.default_parameters().barrier_stiffness.clone().requires_grad_()
     fields = {n: getattr(batch, n).clone().requires_grad_() for n in ("positions", "body_poses")}
     energy = sim.energy(
-        batch.replace(**fields), sim.parameters().replace(barrier_stiffness=shared), parts=True
+        batch.replace(**fields),
+        parameters=sim.default_parameters().replace(barrier_stiffness=shared),
+        parts=True,
     )["contact"]
     assert energy.shape == (2,)
     weights = torch.tensor([1.0, -3.0], dtype=F64)
@@ -339,12 +343,12 @@ def test_many_losses_go_back_at_once(batch, monkeypatch):
     if batch:
         state = dc.stack([state, state])
     x = state.positions.clone().requires_grad_()
-    thickness = sim.parameters().thickness.clone().requires_grad_()
+    thickness = sim.default_parameters().thickness.clone().requires_grad_()
     parts = torch.stack(
         list(
             sim.energy(
                 state.replace(positions=x),
-                sim.parameters().replace(thickness=thickness),
+                parameters=sim.default_parameters().replace(thickness=thickness),
                 parts=True,
             ).values()
         )
@@ -415,7 +419,7 @@ def test_overlapping_surfaces_have_no_gradient_of_contact():
 
 def test_the_gradient_is_minus_the_forces_of_a_step_without_friction():
     sim, state = case("handled")
-    frictionless = sim.parameters().replace(friction=0.0)
+    frictionless = sim.default_parameters().replace(friction=0.0)
     with torch.no_grad():
         after = sim.step(state, None, frictionless)
     x, poses = (t.clone().requires_grad_() for t in (after.positions, after.body_poses))

@@ -225,7 +225,7 @@ def test_a_box_rests_on_a_pinned_sheet():
 
 def directions(sim, names):
     """Parameters, and a random direction of each that keeps its sign."""
-    given = sim.parameters()
+    given = sim.default_parameters()
     for k, name in enumerate(names):
         value = getattr(given, name)
         generator = torch.Generator().manual_seed(k)
@@ -261,7 +261,7 @@ def test_gradients_are_those_of_the_equilibrium(make, step, names):
     )
 
     def loss(start, name, value):
-        end = sim.equilibrium(start, None, sim.parameters().replace(**{name: value}))
+        end = sim.equilibrium(start, None, sim.default_parameters().replace(**{name: value}))
         return (end.positions * weights).sum()
 
     for name, value, way in directions(sim, names):
@@ -333,7 +333,7 @@ def pulled_box():
 @pytest.mark.parametrize("name", ["barrier_distance", "friction", "gravity"])
 def test_gradients_count_how_friction_and_normal_forces_settle(name):
     simulator, state, control = pulled_box()
-    given = simulator.parameters()
+    given = simulator.default_parameters()
     value = getattr(given, name)
 
     def place(tensor):
@@ -368,7 +368,7 @@ def test_gradients_in_a_batch_are_those_alone_where_only_some_are_in_contact():
     states = [touching, touching.replace(body_poses=far)]
 
     def gradients(state, batch):
-        given = simulator.parameters()
+        given = simulator.default_parameters()
         given = given.replace(gravity=given.gravity.expand(*batch, 3).clone().requires_grad_())
         found = simulator.equilibrium(state, None, given)
         both = torch.stack([found.positions.sum(), found.positions[..., -1, :].sum()])
@@ -390,7 +390,7 @@ def test_gradients_in_a_batch_are_those_alone_where_only_some_are_in_contact():
 
 def test_tangents_in_a_batch_are_those_alone():
     simulator, state, control = pulled_box()
-    given = simulator.parameters()
+    given = simulator.default_parameters()
 
     def places(states, friction):
         found = simulator.equilibrium(states, control, given.replace(friction=friction))
@@ -405,7 +405,7 @@ def test_tangents_in_a_batch_are_those_alone():
 
 def test_slip_velocities_and_failures_of_others_change_no_bit():
     simulator, state, control = pulled_box()
-    given = simulator.parameters().replace(slip_velocity=torch.tensor(1e-2, dtype=F64))
+    given = simulator.default_parameters().replace(slip_velocity=torch.tensor(1e-2, dtype=F64))
     alone = simulator.equilibrium(state, control, given)
     finer = given.replace(slip_velocity=torch.tensor([1e-2, 1e-6], dtype=F64))
     beside = simulator.equilibrium(dc.stack([state, state]), control, finer)
@@ -417,7 +417,7 @@ def test_environments_of_a_batch_are_those_alone():
     """Friction settles within two steps in the first, and in eight in the second."""
     sim = drape(rows=7)
     state = sim.initial_state(2)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     bending = parameters.bending * torch.tensor([0.3, 1.0], dtype=F64)
     friction = parameters.friction * torch.tensor([1.0, 5.0], dtype=F64).reshape(2, 1, 1)
     given = parameters.replace(bending=bending, friction=friction)
@@ -435,12 +435,14 @@ def test_what_resists_motion_changes_nothing_at_rest():
     names, ends = ("damping", "normal_drag", "tangential_drag"), []
     for size in (0.0, 50.0):
         given = {n: torch.tensor(size, dtype=F64, requires_grad=True) for n in names}
-        found = sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(**given))
+        found = sim.equilibrium(
+            sim.initial_state(), None, sim.default_parameters().replace(**given)
+        )
         gradients = torch.autograd.grad(found.positions.sum(), list(given.values()))
         assert not any(gradient.any() for gradient in gradients)
         ends.append((found.report.iterations, found.positions.tolist()))
     assert ends[0] == ends[1]
-    again = sim.equilibrium(found, None, sim.parameters())
+    again = sim.equilibrium(found, None, sim.default_parameters())
     assert again.report.iterations < found.report.iterations
 
 
@@ -560,8 +562,8 @@ def test_what_does_not_settle_has_no_gradient(monkeypatch):
     monkeypatch.setattr(equilibrium, "_REPEATS", 1)
     silent = dc.SolverOptions(tolerance=1e-12, throw=False)
     sim = dc.Simulator(drape().scene, 0.01, solver=silent)
-    bending = sim.parameters().bending.clone().requires_grad_()
-    parameters = sim.parameters().replace(bending=bending)
+    bending = sim.default_parameters().bending.clone().requires_grad_()
+    parameters = sim.default_parameters().replace(bending=bending)
     found = sim.equilibrium(sim.initial_state(), None, parameters)
     assert found.report.status == "not_converged"
     with pytest.raises(dc.NotConverged, match="no gradient"):

@@ -170,14 +170,14 @@ def check_same_step(sim, named, explicit):
     state = sim.initial_state()
     velocities = state.velocities + torch.tensor([0.3, 0.1, -0.5], dtype=F64)
     state = state.replace(velocities=velocities)
-    ends = [sim.step(state, None, sim.parameters().replace(**p)) for p in (named, explicit)]
+    ends = [sim.step(state, None, sim.default_parameters().replace(**p)) for p in (named, explicit)]
     for name in ("positions", "body_poses", "joint_positions", "joint_velocities"):
         assert torch.equal(*(getattr(end, name) for end in ends))
     return sim.step(state), ends[0]
 
 
 def changed(sim, name, rows, value):
-    tensor = getattr(sim.parameters(), name).clone()
+    tensor = getattr(sim.default_parameters(), name).clone()
     tensor[rows] = torch.as_tensor(value, dtype=F64)
     return tensor
 
@@ -200,7 +200,7 @@ def changed(sim, name, rows, value):
 def test_named_values_are_those_of_their_rows(sim, name, key, value, rows):
     if rows is None:
         rows = sim._layout.link_names.index(key)
-    explicit = getattr(sim.parameters(), name)
+    explicit = getattr(sim.default_parameters(), name)
     if name in ("stretch", "density"):
         explicit = explicit.expand(2).clone()
         explicit[rows] = value
@@ -214,7 +214,7 @@ def test_named_values_of_faces_and_vertices(sim):
         name: len(c.faces) for name, c in zip(("sheet", "other"), sim.scene.cloths, strict=True)
     }
     soft = torch.linspace(300, 900, faces["other"], dtype=F64)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     first = parameters.stretch.expand(2)[0].expand(faces["sheet"])
     plain, other = check_same_step(
         sim, {"stretch": {"other": soft}}, {"stretch": torch.cat([first, soft])}
@@ -242,8 +242,8 @@ def test_faces_that_are_not_named_keep_the_value_of_their_cloth():
 
 def test_gradients_reach_named_values_and_batches_have_their_own(sim):
     mass = torch.tensor([0.5, 2.0], dtype=F64, requires_grad=True)
-    given = sim.parameters().replace(
-        body_mass={"box": mass}, body_inertia=sim.parameters().body_inertia
+    given = sim.default_parameters().replace(
+        body_mass={"box": mass}, body_inertia=sim.default_parameters().body_inertia
     )
     states = sim.initial_state(2)
     states.body_poses[:, 0, 2] += 3.0  # away from everything
@@ -285,7 +285,7 @@ def test_gradients_reach_named_values_and_batches_have_their_own(sim):
 )
 def test_wrong_names_and_values_are_refused(sim, changes, message):
     with pytest.raises(dc.InvalidInput, match=message):
-        sim.step(sim.initial_state(), None, sim.parameters().replace(**changes))
+        sim.step(sim.initial_state(), None, sim.default_parameters().replace(**changes))
 
 
 # --- Rollouts ------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def hanging():
 
 
 def test_parameters_of_each_step_are_those_of_a_loop(hanging):
-    sim, base = hanging, hanging.parameters()
+    sim, base = hanging, hanging.default_parameters()
     scale = torch.tensor(2.0, dtype=F64, requires_grad=True)
     seen = []
 
@@ -323,7 +323,7 @@ def test_parameters_of_each_step_are_those_of_a_loop(hanging):
 
 
 def test_parameters_that_change_before_backward_are_refused(hanging):
-    base, calls = hanging.parameters(), []
+    base, calls = hanging.default_parameters(), []
     gravity = base.gravity.clone().requires_grad_()
 
     def parameters(k, state):

@@ -30,7 +30,7 @@ def sim():
 def slide(sim, friction, batch_size=None, **options):
     state = sim.initial_state(batch_size)
     push = torch.tensor([0.3, 0.0, 0.0], dtype=F64).expand(state.positions.shape)
-    parameters = sim.parameters().replace(friction=friction)
+    parameters = sim.default_parameters().replace(friction=friction)
     return sim.rollout(state.replace(velocities=push), None, parameters, steps=4, **options)[-1]
 
 
@@ -38,7 +38,7 @@ def matrix(sim, mu):
     """Friction of the scene, of which both entries of the first two surfaces are mu."""
     place = torch.zeros(3, 3, dtype=F64)
     place[0, 1] = place[1, 0] = 1
-    return torch.where(place > 0, mu, sim.parameters().friction)
+    return torch.where(place > 0, mu, sim.default_parameters().friction)
 
 
 @pytest.mark.parametrize("pair", [("mat", "floor"), ("floor", "mat")])
@@ -106,11 +106,11 @@ def test_couplings_take_it():
     for coupling in ("monolithic", "rigid_to_cloth", "cloth_to_rigid"):
         sim = dc.Simulator(scene, 0.005, coupling=coupling, contact=contact)
         pairs = {("box", "mat"): 0.7, ("box", "floor"): 0.1}
-        friction = sim.parameters().friction.clone()
+        friction = sim.default_parameters().friction.clone()
         for i, j, mu in ((0, 2, 0.7), (1, 2, 0.1)):
             friction[i, j] = friction[j, i] = mu
         ends = [
-            sim.step(sim.initial_state(), None, sim.parameters().replace(friction=given))
+            sim.step(sim.initial_state(), None, sim.default_parameters().replace(friction=given))
             for given in (pairs, friction)
         ]
         assert torch.equal(ends[0].positions, ends[1].positions)

@@ -78,7 +78,7 @@ def test_a_control_is_a_tree_of_what_it_sets(simulator):
 
 
 def test_parameters_are_a_tree_of_what_they_set(simulator):
-    parameters = simulator.parameters()
+    parameters = simulator.default_parameters()
     found = torch.func.grad(
         lambda p: simulator.step(simulator.initial_state(), None, p).positions.square().sum()
     )(parameters)
@@ -93,9 +93,9 @@ def test_parameters_are_a_tree_of_what_they_set(simulator):
 def test_mapped_parameters_of_another_shape_may_have_a_batch_axis(simulator):
     """Eight faces and eight environments: a simulator's own [F] is clear, a new one is not."""
     state = simulator.initial_state(8)
-    same = tree_map(torch.clone, simulator.parameters())
+    same = tree_map(torch.clone, simulator.default_parameters())
     simulator.step(state, None, same)
-    wide = tree_map(lambda t: t.expand(8, *t.shape).clone(), simulator.parameters())
+    wide = tree_map(lambda t: t.expand(8, *t.shape).clone(), simulator.default_parameters())
     with pytest.raises(dc.InvalidInput, match=r"`parameters\.\w+` .* environment or per face"):
         simulator.step(state, None, wide)
 

@@ -91,7 +91,7 @@ PARAMETERS = [f.name for f in dataclasses.fields(dc.Parameters) if not f.name.st
 @pytest.mark.parametrize("field", [name for name in PARAMETERS if name != "poisson"])
 def test_a_parameter_of_absurd_size_is_refused(moved_sim, field):
     sim = moved_sim
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     bad = parameters.replace(**{field: with_last(getattr(parameters, field), 1e300)})
     with pytest.raises(
         dc.InvalidInput, match=rf"^step: `parameters\.{field}` must be at most 1e\+30 in size"
@@ -104,7 +104,7 @@ def test_a_parameter_of_absurd_size_is_refused(moved_sim, field):
     ["stretch", "density", "barrier_stiffness", "barrier_distance", "slip_velocity"],
 )
 def test_a_parameter_that_vanishes_is_refused(sim, field):
-    bad = sim.parameters().replace(**{field: torch.tensor(1e-200, dtype=F64)})
+    bad = sim.default_parameters().replace(**{field: torch.tensor(1e-200, dtype=F64)})
     with pytest.raises(
         dc.InvalidInput, match=rf"^step: `parameters\.{field}` must be at least 1e-30"
     ):

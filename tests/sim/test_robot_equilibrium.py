@@ -79,7 +79,9 @@ def test_what_resists_motion_changes_nothing_at_rest(arm):
             name: torch.full((2,), size, dtype=F64, requires_grad=True)
             for name in ("joint_damping", "joint_viscosity")
         }
-        found = sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(**given))
+        found = sim.equilibrium(
+            sim.initial_state(), None, sim.default_parameters().replace(**given)
+        )
         gradients = torch.autograd.grad(found.joint_positions.sum(), list(given.values()))
         assert not any(gradient.any() for gradient in gradients)
         ends.append((found.report.iterations, *found.joint_positions.tolist()))
@@ -156,11 +158,11 @@ def test_gradients_of_an_arm_that_presses_on_a_sheet(arm):
 
     def by_parameter(name):
         return lambda value: value_of(
-            sim.equilibrium(found, None, sim.parameters().replace(**{name: value}))
+            sim.equilibrium(found, None, sim.default_parameters().replace(**{name: value}))
         )
 
     for name in ("link_mass", "link_center", "joint_stiffness", "stretch", "friction", "gravity"):
-        value = getattr(sim.parameters(), name)
+        value = getattr(sim.default_parameters(), name)
         exact, differences = slopes(by_parameter(name), value, random_way(value), 1e-5)
         assert exact == pytest.approx(differences, rel=1e-4), name
 
@@ -184,7 +186,7 @@ def test_gradients_of_an_arm_that_presses_on_a_sheet(arm):
 def test_a_batch_of_arms_has_the_bits_of_each(arm):
     sim = onto_a_sheet(arm)
     stiffness = torch.tensor([[3.0, 3.0], [5.0, 1.0]], dtype=F64)
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     batch = sim.equilibrium(
         sim.initial_state(2), None, parameters.replace(joint_stiffness=stiffness)
     )
@@ -204,7 +206,9 @@ def test_a_rollout_ends_there(arm):
         floor = dc.RigidBody.plane(3.0, pose=[0, 0, -3, 1, 0, 0, 0])
         sim = dc.Simulator(dc.Scene([], [floor], [robot]), dt, contact=contact, solver=TIGHT)
         found = sim.equilibrium(sim.initial_state())
-        given = sim.parameters().replace(joint_viscosity=torch.tensor([0.5, 0.5], dtype=F64))
+        given = sim.default_parameters().replace(
+            joint_viscosity=torch.tensor([0.5, 0.5], dtype=F64)
+        )
         with torch.no_grad():
             end = sim.rollout(sim.initial_state(), parameters=given, steps=int(4 / dt))[-1]
         errors.append(float((end.joint_positions - found.joint_positions).abs().max()))
@@ -220,7 +224,7 @@ def test_a_hand_rests_on_a_floor():
     floor = dc.RigidBody.plane(3.0, name="floor")
     sim = dc.Simulator(dc.Scene([], [floor], [hand]), 0.005, contact=contact, solver=TIGHT)
     found = sim.equilibrium(sim.initial_state())
-    weight = float(sim.parameters().link_mass.sum()) * 9.81
+    weight = float(sim.default_parameters().link_mass.sum()) * 9.81
     force = found.body_forces[sim.slices["floor"]].sum(0)
     expected = torch.tensor([0, 0, -weight], dtype=F64)
     torch.testing.assert_close(force, expected, rtol=0, atol=1e-6 * weight)
@@ -281,14 +285,16 @@ def test_a_joint_that_nothing_holds_is_named(arm, viscosity):
     sim = alone(robot, gravity=(0, 9.81, 0))  # along the axes
     drag = torch.full((2,), viscosity, dtype=F64)
     with pytest.raises(dc.SimulationError, match="joint 'arm/elbow' is free to move"):
-        sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(joint_viscosity=drag))
+        sim.equilibrium(
+            sim.initial_state(), None, sim.default_parameters().replace(joint_viscosity=drag)
+        )
 
 
 def test_the_environment_whose_joint_nothing_holds_is_named(arm):
     """With that joint, though another yields more elsewhere; a damper alone does not hold it."""
     sim = alone(arm(stiffness=5.0, damping=1.0), gravity=(0, 9.81, 0))
     gains = torch.tensor([[2.0, 50.0], [50.0, 0.0], [2.0, 50.0], [50.0, 0.0]], dtype=F64)
-    parameters = sim.parameters().replace(joint_stiffness=gains)
+    parameters = sim.default_parameters().replace(joint_stiffness=gains)
     with pytest.raises(dc.SimulationError, match="joint 'arm/elbow' is free to move") as error:
         sim.equilibrium(sim.initial_state(4), None, parameters)
     assert error.value.environments == (1, 3)
@@ -366,7 +372,7 @@ def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, na
     corners = {"corners": [0, 2]}
     sheet = dc.Cloth.grid(3, 3, 0.2, pose=[5, 0, 0, 1, 0, 0, 0], pins=corners)
     sim = dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, solver=TIGHT)
-    state, parameters = sim.initial_state(), sim.parameters()
+    state, parameters = sim.initial_state(), sim.default_parameters()
     given = {
         "targets": state.joint_positions,
         "base": turned(state.base_poses[0], 0.4),

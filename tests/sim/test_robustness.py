@@ -115,7 +115,7 @@ def test_a_time_step_of_another_type_is_refused(dt):
 
 
 def test_a_collapsed_rest_shape_is_refused(sim):
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     rest = parameters.rest_positions.clone()
     rest[1] = rest[0]
     with pytest.raises(dc.InvalidInput, match=r"area > 0 in `rest_positions`.* \[0\]"):

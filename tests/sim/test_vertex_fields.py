@@ -26,13 +26,13 @@ def faces(simulator):
 def test_a_face_has_the_mean_of_its_corners(simulator, name):
     _, corners = faces(simulator)
     generator = torch.Generator().manual_seed(1)
-    default = getattr(simulator.parameters(), name).item() or 0.5
+    default = getattr(simulator.default_parameters(), name).item() or 0.5
     values = default * (1 + torch.rand(15, generator=generator, dtype=torch.float64))
     start = simulator.initial_state()
     start = start.replace(velocities=torch.linspace(0, 1, 45, dtype=torch.float64).reshape(15, 3))
 
     def loss(values):
-        given = simulator.parameters().replace(**{name: values})
+        given = simulator.default_parameters().replace(**{name: values})
         return simulator.step(start, None, given).positions.square().sum()
 
     at_vertices, at_faces = values.clone().requires_grad_(), values[corners].mean(-1)
@@ -71,7 +71,7 @@ def test_as_many_vertices_as_faces_are_refused_and_names_are_clear():
     material = dc.Material(density=torch.linspace(0.1, 0.2, 12))
     sheet = dc.Cloth.grid((4, 3), 0.3, name="sheet", material=material)
     simulator = dc.Simulator(dc.Scene([sheet]), 0.01)
-    own = simulator.parameters()
+    own = simulator.default_parameters()
     start = simulator.initial_state()
     expected = simulator.step(start).positions
     assert torch.equal(simulator.step(start, None, own).positions, expected)

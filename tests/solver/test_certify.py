@@ -93,7 +93,7 @@ def gradients_by(sim, case):
         "positions": start.positions.clone().requires_grad_(),
         "velocities": start.velocities.clone().requires_grad_(),
     }
-    parameters = sim.parameters()
+    parameters = sim.default_parameters()
     friction = parameters.friction.clone().requires_grad_()
     state = sim.step(
         start.replace(**leaves), control_of(case), parameters.replace(friction=friction)

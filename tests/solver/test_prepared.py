@@ -37,7 +37,7 @@ def test_no_step_has_the_numbers_of_another(name):
     """A changed parameter counts, and the former one again: as in a simulator without steps."""
     used = simulator()
     state = used.initial_state()
-    given = used.parameters()
+    given = used.default_parameters()
     changed = given.replace(**{name: 0.5 * getattr(given, name) + 1e-5})
     first, other, again = (used.step(state, None, p) for p in (given, changed, given))
     fresh = simulator().step(state, None, changed)

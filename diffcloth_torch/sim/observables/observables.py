@@ -11,7 +11,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.autograd.guards import guarded
 from diffcloth_torch.checks import check_bool, check_count, check_shape
 from diffcloth_torch.dynamics.totals import Totals
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, Fields
 from diffcloth_torch.operations import label
@@ -229,9 +229,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: Literal[False] = False,
     ) -> Tensor: ...
 
@@ -239,9 +239,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: Literal[True],
     ) -> dict[str, Tensor]: ...
 
@@ -249,9 +249,9 @@ class Observables:
     def energy(
         self,
         state: State,
+        control: Control | None = None,
         parameters: Parameters | None = None,
         *,
-        control: Control | None = None,
         parts: bool = False,
     ) -> Tensor | dict[str, Tensor]:
         """Return the potential energy of a state: elasticity, springs, gravity, contact.
@@ -271,10 +271,10 @@ class Observables:
 
         Args:
             state: Positions, poses and joints at which the energy is evaluated.
-            parameters: Physical parameters; None: the scene's.
             control: Control as in a step. Only `attachments`, `attachment_weights` and `soft_pins`
                 store energy; other fields, such as forces and the motion of pins and bodies, have
                 no effect.
+            parameters: Physical parameters; None: the scene's.
             parts: If true, return the parts of the energy.
 
         Returns:
@@ -287,6 +287,14 @@ class Observables:
             SimulationError: In backward, if surfaces overlap: the energy is infinite there.
         """
         check_bool("energy: `parts`", parts)
+        second: object = control
+        if isinstance(second, Parameters) and parameters is None:  # the order of 0.1
+            warn_caller(
+                "energy: the order is (state, control, parameters): write energy(state, "
+                "parameters=...)",
+                FutureWarning,
+            )
+            control, parameters = None, second
         given, batch = self._border.enter(state, control, parameters)
         if control is not None:
             unset = self._border.enter(state, None, None)[0].control

@@ -14,12 +14,15 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.reprs import record_text, value_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.environments import Combination
 
 __all__ = ["Contacts", "PairContact"]
 
 Pair = tuple[str, str]
+
+_MOST_SHOWN = 8  # pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +144,10 @@ class Contacts:
         return len(self.counts)
 
     def __repr__(self) -> str:
-        pairs = (f"{pair}: {_plain(count)}" for pair, count in self.counts.items())
-        return f"Contacts({', '.join(pairs)})"
+        pairs = [f"{pair}: {value_text(_plain(count))}" for pair, count in self.counts.items()]
+        more = len(pairs) - _MOST_SHOWN
+        rest = [f"and {more} more pairs"] if more > 0 else []
+        return record_text("Contacts", pairs[:_MOST_SHOWN] + rest)
 
     @staticmethod
     def combined(how: Combination, parts: Sequence[Contacts]) -> Contacts:

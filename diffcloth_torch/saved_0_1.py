@@ -1,0 +1,80 @@
+"""Files and names of 0.1: where its classes are now, and how its checkpoints become those of today.
+
+A checkpoint of 0.1 is an archive of `torch.save` alone, without the record that `checkpoint.py`
+adds. Results of a simulation are kept as they were: this version rounds differently, and its tasks
+have other rewards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+__all__ = ["CHECKPOINTS", "MODULES", "OPTIONS", "with_names_of_today"]
+
+MODULES = {
+    "sim.contact_points": ("ContactPoints",),
+    "sim.contacts": ("Contacts",),
+    "sim.controls": ("Control", "Parameters"),
+    "sim.report": ("Report",),
+    "sim.state": ("State",),
+    "sim.surfaces": ("LinkSurfaces", "Surfaces"),
+}
+"""Module that files name, where there is none now -> its classes."""
+
+OPTIONS = {
+    "actor_rate": "learning_rate",
+    "critic_rate": "critic_learning_rate",
+    "deviation": "init_std",
+    "gradient_norm": "max_grad_norm",
+    "plan_rate": "plan_learning_rate",
+    "target_rate": "tau",
+    "temperature_rate": "temperature_learning_rate",
+    "trace": "gae_lambda",
+}
+"""Option of `TrainerOptions` -> its name now."""
+
+
+def with_names_of_today(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of a trainer under their names now."""
+    return {OPTIONS.get(name, name): value for name, value in options.items()}
+
+
+def _descent(content: dict[str, Any]) -> dict[str, Any]:
+    """An optimization; evaluations did not measure the time of processors."""
+    found = content["found"]
+    if found is None:
+        return content
+    unknown = {"cpu_seconds": None}
+    changes = {"history": [record | unknown for record in found["history"]]}
+    for name in ("first", "best"):
+        evaluation = found[name]
+        changes[name] = evaluation | {"statistics": evaluation["statistics"] | unknown}
+    return content | {"found": found | changes}
+
+
+def _trainer(content: dict[str, Any]) -> dict[str, Any]:
+    """A trainer, without its environments: they drew other starts.
+
+    All observations were in the axes of the world.
+    """
+    return content | {
+        "options": with_names_of_today(content["options"]),
+        "task": content["task"] | {"frame": "world"},
+        "return": torch.zeros_like(content["return"]),
+        "places": None,
+    }
+
+
+def _fit(content: dict[str, Any]) -> dict[str, Any]:
+    return content
+
+
+CHECKPOINTS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "fit": _fit,
+    "optimize": _descent,
+    "trainer": _trainer,
+}
+"""Kind of a checkpoint -> the content of today, from the content of a file."""
