@@ -154,8 +154,8 @@ class FlingCloth(SpreadCloth):
 
     The start draws the pleats, and one of two opposite edges for the pickers. With the covered
     share A / Amax of the area, as in `SpreadCloth`, and the mean height h of the sheet above the
-    table, the reward is graded(1 - A / Amax + h / side, .08, .5): the sheet must lie on the table. After
-    the fling of RGBench.
+    table, the reward is graded(1 - A / Amax + h / side, .08, .5): the sheet must lie on the table.
+    After the fling of RGBench.
     """
 
     name = "FlingCloth"
