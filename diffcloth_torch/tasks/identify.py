@@ -1,4 +1,4 @@
-"""Identify: fit parameters of a scene to what was observed of it."""
+"""Identify: fit parameters of a scene to observations of its motion or equilibrium."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from diffcloth_torch.viewers.fitted import Track
 
 __all__ = ["Identify", "Observations"]
 
-_VELOCITY = "velocity"  # the one variable that is no parameter: of all vertices without pins
-_LARGEST_OBSERVATION = 256 << 20  # bytes of a file: an hour of a camera with a hundred markers
-_SAME_POINT = 1e-6  # of the size of a mesh: vertices of two meshes are one material point
+_VELOCITY = "velocity"  # initial velocity of all vertices without pins; not a parameter
+_LARGEST_OBSERVATION = 256 << 20  # bytes of a file: one hour of video with a hundred markers
+_SAME_POINT = 1e-6  # largest distance of vertices of two meshes at one material point, over size
 
 
 class Identify(ConfiguredTask):
-    """A scene that moves as its configuration says, and observations to fit it to."""
+    """A scene with the motion of its configuration, and the observations for the fit."""
 
     Config = FitConfig
 
@@ -73,15 +73,15 @@ class Identify(ConfiguredTask):
         }
 
     def options(self) -> dict[str, Any]:
-        """Give the options of `fit`."""
+        """Return the options of `fit`."""
         return self._fit.model_dump(exclude={"variables", "trajectories"})
 
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A scene and how a trajectory moves it.
+    """A scene with the motion of a trajectory.
 
-    A `velocity` is that of the real start: in free fall x(t) = v t + g t^2 / 2 at all steps.
+    `velocity` is the velocity at the real start: in free fall x(t) = v t + g t^2 / 2 at all steps.
     """
 
     task: ConfiguredTask
@@ -89,7 +89,7 @@ class _Motion:
     steps: list[int] | None  # None: at equilibrium
 
     def simulate(self, values: Mapping[str, Tensor]) -> list[State]:
-        """The states that are observed, at values of the variables."""
+        """Simulate the observed states at values of the variables."""
         simulator, start = self.task.simulator, self.task.initial_state()
         given: dict[str, Any] = {n: v for n, v in values.items() if n in PARAMETERS}
         parameters = simulator.parameters().replace(**given)
@@ -101,7 +101,7 @@ class _Motion:
             for pinned in self.task.scene.cloths[0].pins.values():
                 free[torch.from_numpy(pinned.astype(np.int64))] = 0.0
             assert parameters.gravity is not None  # the simulator sets it
-            # Implicit Euler lets gravity act for half a step too long before the first position.
+            # In implicit Euler, gravity acts for half a step too long before the first position.
             late = 0.5 * simulator.dt * parameters.gravity
             start = start.replace(velocities=free * (velocity - late))
         controller = self.task.controller({})
@@ -113,7 +113,7 @@ class _Motion:
 
 @dataclass(frozen=True, eq=False)
 class _Observed:
-    """A motion, and what was seen of it."""
+    """A motion and its observations."""
 
     section: TrajectorySection
     motion: _Motion
@@ -121,11 +121,11 @@ class _Observed:
     seen: FloatArray
 
     def residuals(self, values: Mapping[str, Tensor]) -> Tensor:
-        """What is simulated less what was seen, over the noise."""
+        """Differences of simulation and observations, divided by the noise."""
         return self._compare(self.motion.simulate(values))
 
     def track(self, values: Mapping[str, Tensor]) -> Track:
-        """What is simulated, and beside it what was seen."""
+        """The simulated states and their observations, for a viewer."""
         with torch.no_grad(), noting() as notes:
             states = self.motion.simulate(values)
             self._compare(states)
@@ -159,12 +159,12 @@ class Observations:
     def __call__(
         self, parameters: Parameters, values: Mapping[str, Tensor] | None = None
     ) -> list[Tensor]:
-        """Give the residuals of each trajectory."""
+        """Return the residuals of each trajectory."""
         given = {n: v for n, v in vars(parameters).items() if isinstance(v, Tensor)}
         return [t.residuals(given | dict(values or {})) for t in self._trajectories]
 
     def scenes(self) -> list[Scene]:
-        """Give the scene of each trajectory."""
+        """Return the scene of each trajectory."""
         return [t.motion.task.scene for t in self._trajectories]
 
     def tracks(self, values: Mapping[str, Tensor]) -> list[Track]:
@@ -221,7 +221,7 @@ def _synthesize(
     motion: _Motion,
     vertices: list[int],
 ) -> FloatArray:
-    """Simulate what was observed, on a mesh of its own, and add noise."""
+    """Simulate synthetic observations, on a mesh of their own, and add noise."""
     where = f"{source}: `fit.trajectories.{section.name}.synthetic`"
     for name in synthetic.values:
         _check_name(where, name)
@@ -253,7 +253,7 @@ def _synthesize(
 def _same_points(
     where: str, task: ConfiguredTask, other: ConfiguredTask, vertices: list[int]
 ) -> list[int]:
-    """Vertices of another mesh at the material points of these, which are those at rest."""
+    """Vertices of another mesh at the same material points, by their rest positions."""
     from scipy.spatial import cKDTree
 
     mine, theirs = (np.asarray(t.scene.cloths[0].rest_positions) for t in (task, other))
