@@ -44,8 +44,8 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
     A prescribed motion that is infeasible is blocked, as by a safety stop: `info["blocked"]`. Its
     reward is `Task.worst`, and the derivative by the action is zero. An episode ends at the horizon
-    of the task (`truncated`), or where the simulation fails (`terminated`, with `info["failed"]`):
-    the reward is then `Task.worst` for this step and for each that is left, without a gradient.
+    of the task (`truncated`), or if the simulation fails (`terminated`, with `info["failed"]`): the
+    reward is then `Task.worst` for this step and each remaining step, without a gradient.
     With `AutoresetMode.SAME_STEP` a new episode begins in the step that ends one: the step returns
     the observation of the new start, and `info["final_obs"]` is the observation of the end, with
     its graph, if `info["_final_obs"]` is true. With `AutoresetMode.DISABLED`, a new episode is

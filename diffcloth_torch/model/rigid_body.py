@@ -206,7 +206,7 @@ class RigidBody:
 
     @property
     def contact_surface(self) -> ContactSurface:
-        """Surface for contact: the mesh of the body, or the skeleton of its analytic surface."""
+        """Surface for contact, which is the mesh, or the skeleton of the analytic surface."""
         if not self.smooth or self.primitive is None:
             return ContactSurface(self.vertices, self.faces, 0.0)
         return round_surface(self.primitive)

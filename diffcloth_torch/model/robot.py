@@ -334,7 +334,7 @@ class Robot:
 
     @property
     def contact_surfaces(self) -> tuple[ContactSurface | None, ...]:
-        """Contact surface of each link: its mesh, its skeleton if smooth, or None."""
+        """Contact surface of each link, which is its mesh, its skeleton if smooth, or None."""
         return tuple(
             None
             if mesh is None
@@ -478,7 +478,7 @@ def _check_known(field: str, given: Iterable[object], names: Sequence[str]) -> N
 def _modes(owner: str, given: object, names: Sequence[str]) -> list[str | None]:
     """Actuation of each joint, from one mode for all, from name -> mode, or from a list of modes.
 
-    None: the mode follows from the limits of the joint.
+    Without a mode (None), the limits of the joint determine the mode.
     """
     label = f"{owner}: `actuation`"
     modes: list[object]
