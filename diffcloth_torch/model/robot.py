@@ -240,9 +240,8 @@ class Robot:
         """Convert a chain of pytorch-kinematics, with surfaces and inertias that chains lack.
 
         A chain has frames, joints and their limits. It does not keep masses, collision shapes,
-        damping and friction of joints, or mimicking joints of a file: use `load` if there is a
-        file. Frames become links with the same names; offsets in single precision are exact to
-        1e-7.
+        damping and friction of joints, or mimic relations of a file: use `load` if there is a file.
+        Frames become links with the same names; offsets in single precision are exact to 1e-7.
 
         >>> chain = pk.build_chain_from_urdf(Path("arm.urdf").read_bytes())
         >>> hand = dc.RigidBody.box(0.1)
