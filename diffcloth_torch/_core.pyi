@@ -1,5 +1,5 @@
-# The C++ extension. What the package uses is typed here. docs/core_stub.py takes the place of the
-# core where the site is built, and needs the names that defaults are checked against.
+# The C++ extension: types of the names that the package uses. docs/core_stub.py replaces the core
+# when the site is built, and needs the values of names against which defaults are checked.
 
 from typing import Any
 
@@ -18,15 +18,15 @@ schemes: dict[str, dict[str, bool]] = {
         "metrics": False,
     },
 }
-"""What each is able to: "barrier", "moves_bodies", "elastic_stage", "metrics"; default first."""
+"""Capabilities of each scheme; the default is first."""
 integrators: list[str] = ["implicit_euler", "second_order"]
 metrics: list[str] = ["energy", "elastic", "mass", "identity"]
 elastic_solvers: list[str] = ["newton", "projective"]
 criteria: list[str]
-"""Of the number "criterion" of a step: names of the criteria that end a solve."""
+"""Names of the criteria that end a solve, indexed by the number "criterion" of a step."""
 input_names: list[str]
 number_names: list[str]
-"""Of the lists "numbers" that a step returns."""
+"""Names of the entries of "numbers", which a step returns."""
 
 class SimulationError(RuntimeError): ...
 

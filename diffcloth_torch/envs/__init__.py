@@ -5,9 +5,9 @@
 >>> observation, info = env.reset(seed=0)
 >>> observation, reward, terminated, truncated, info = env.step(actions)
 
-Importing this module also lets gymnasium find them:
-`gymnasium.make("diffcloth/FoldCloth-v0")` is one environment with NumPy arrays, and
-`gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)` several, with tensors.
+Importing this module also registers the environments in gymnasium:
+`gymnasium.make("diffcloth/FoldCloth-v0")` makes one environment with NumPy arrays, and
+`gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)` makes several, with tensors.
 """
 
 from __future__ import annotations
@@ -78,11 +78,12 @@ def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
     """Make environments of a task.
 
     Args:
-        task: One of `TASKS` by name, or a task of your own.
-        num_envs: How many environments step together.
-        **options: `seed`, `autoreset_mode` and `render_mode` as for `ClothVectorEnv`; the others go
-            to the task, where it is given by name: `size`, `horizon`, `substeps`, `observation`,
-            `material`, `contact`, `solver`, `frame`, `randomize`, and those of its own.
+        task: Name of one of `TASKS`, or a task of your own.
+        num_envs: Number of environments that step together.
+        **options: `seed`, `autoreset_mode` and `render_mode` as for `ClothVectorEnv`. The other
+            options are passed to a task given by name: `size`, `horizon`, `substeps`,
+            `observation`, `material`, `contact`, `solver`, `frame`, `randomize`, and options of the
+            task.
 
     Raises:
         InvalidInput: If a name or value is not accepted.
@@ -96,9 +97,9 @@ def make_single(task: str | Task, *, render_mode: str | None = None, **options: 
     """Make one environment of a task with NumPy arrays, as `gymnasium.make` does.
 
     Args:
-        task: One of `TASKS` by name, or a task of your own.
+        task: Name of one of `TASKS`, or a task of your own.
         render_mode: "rgb_array" for pictures by `render`; None for none.
-        **options: Of the task, where it is given by name, as for `make`.
+        **options: Options of a task given by name, as for `make`.
 
     Raises:
         InvalidInput: If a name or value is not accepted.
@@ -109,7 +110,7 @@ def make_single(task: str | Task, *, render_mode: str | None = None, **options: 
 def _task(
     owner: str, task: str | Task, options: dict[str, Any], others: tuple[str, ...] = ()
 ) -> Task:
-    """The task that is given, or the one of that name with options."""
+    """The given task, or the task with the given name and options."""
     if isinstance(task, str):
         check_choice(f"{owner}: `task`", task, tuple(TASKS))
         accepted = _options(TASKS[task])
@@ -126,7 +127,7 @@ def _task(
 
 
 def _options(task: type[Task]) -> list[str]:
-    """Names that a task takes, or that it passes on to the class before it."""
+    """Names of the options of a task, including options that it passes to its base class."""
     names: list[str] = []
     for kind in task.__mro__:
         parameters = signature(kind).parameters.values()

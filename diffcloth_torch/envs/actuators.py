@@ -1,4 +1,4 @@
-"""What actions move: pickers, pins, rigid bodies and hands, or with what forces they pull."""
+"""Actuators: actions move pickers, pins, rigid bodies and hands, or set forces."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from diffcloth_torch.sim.records.state import State
 __all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocities", "moved"]
 
 Tools = dict[str, Tensor]
-"""What an actuator keeps from one transition to the next, [B, ...] each."""
+"""State of an actuator between transitions, [B, ...] each."""
 
-_NOTHING = -1  # what an open picker holds
+_NOTHING = -1  # index of the vertex held by an open picker
 
 
 class Actuator(ABC):
-    """Makes controls from actions between -1 and 1.
+    """Converts actions between -1 and 1 to controls.
 
     Attributes:
         size: A, the length of an action.
-        vectors: Places in an action at which three numbers are the components of a vector, which
-            turns with the frame of the task.
+        vectors: Indices in an action at which the three components of a vector begin, which is
+            expressed in the frame of the task.
     """
 
     size: int
@@ -50,13 +50,13 @@ class Actuator(ABC):
     def act(
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
-        """Controls of the time steps of a transition, and the tools after it.
+        """Controls of the time steps of a transition, and the tools after the transition.
 
         Args:
-            tools: Before it.
-            state: Before it.
-            actions: [B, A].
-            substeps: How many time steps it has.
+            tools: Tools before the transition.
+            state: State before the transition.
+            actions: Actions [B, A].
+            substeps: Number of time steps of the transition.
         """
 
 
@@ -65,16 +65,17 @@ class Pickers(Actuator):
 
     An action has four numbers for each picker: its displacement, in shares of `stride` along each
     axis, and its grasp. A picker whose grasp is above `opens_at` closes on the nearest vertex
-    within `reach`, and holds it until its grasp is not above it any more. A spring pulls the
-    vertex, with the share of its stiffness that the grasp is on the way from `opens_at` to 1:
-    actions have a gradient in the grasp of a closed picker. With `opens_at=-1` a picker that does
-    nothing is half closed, and gradients say to a policy whether to hold on or to let go.
+    within `reach`, and holds the vertex until its grasp is at or below `opens_at`. A spring pulls
+    the vertex; its stiffness grows linearly with the grasp, from zero at `opens_at` to the full
+    stiffness at 1, so a closed picker has a gradient with respect to its grasp. With `opens_at=-1`
+    a picker with action zero is half closed, and gradients show a policy whether to hold the vertex
+    or to release it.
 
     Attributes:
         count: P, the number of pickers.
         attachments: Springs between each vertex and each picker, for the scene.
         stride: Longest displacement along an axis in a transition [m].
-        reach: Within which a picker closes on a vertex [m].
+        reach: Largest distance at which a picker closes on a vertex [m].
         floor: Lowest height of a picker [m].
         opens_at: The largest grasp of an open picker.
     """
@@ -93,11 +94,11 @@ class Pickers(Actuator):
         """Make pickers for a cloth that has a name.
 
         Args:
-            cloth: What they hold.
-            count: How many there are.
-            stiffness: Of the spring of a closed picker [N/m].
+            cloth: Cloth that the pickers hold.
+            count: Number of pickers.
+            stiffness: Stiffness of the spring of a closed picker [N/m].
             stride: Longest displacement along an axis in a transition [m].
-            reach: Within which a picker closes on a vertex [m].
+            reach: Largest distance at which a picker closes on a vertex [m].
             floor: Lowest height of a picker [m].
             opens_at: The largest grasp of an open picker, at least -1 and below 1.
 
@@ -127,7 +128,7 @@ class Pickers(Actuator):
         )
 
     def start(self, points: Tensor, held: Tensor | None = None) -> Tools:
-        """Pickers at points [B, P, 3], open, or closed on vertices [B, P] that are there."""
+        """Pickers at points [B, P, 3], open, or closed on vertices [B, P] at these points."""
         if held is None:
             held = cpu.full(points.shape[:2], _NOTHING, dtype=torch.int64)
         return {
@@ -148,7 +149,7 @@ class Pickers(Actuator):
         held, offsets = self._close(tools, state.positions, grasp)
         after = before + self.stride * moves
         after = torch.where(after < self._lowest, self._lowest, after)
-        chosen = held[..., None] == self._indices  # nothing where a picker is open
+        chosen = held[..., None] == self._indices  # all False for an open picker
         weights = dict(zip(self._names, (grasp[..., None] * chosen).unbind(dim=1), strict=True))
         controls = []
         for k in range(1, substeps + 1):
@@ -159,7 +160,7 @@ class Pickers(Actuator):
         return controls, {"points": after, "held": held, "offsets": offsets, "grasp": grasp}
 
     def _close(self, tools: Tools, positions: Tensor, grasp: Tensor) -> tuple[Tensor, Tensor]:
-        """What each picker holds, and where that is from it."""
+        """Vertex held by each picker, and the offset of the vertex from the picker."""
         closed = grasp > 0
         goes_on = closed & (tools["held"] != _NOTHING)
         away = positions[:, None] - tools["points"][:, :, None]  # [B, P, N, 3]
@@ -175,7 +176,7 @@ class Pickers(Actuator):
 
 
 class Velocities(Actuator):
-    """Groups of pins, each of which moves as one with a velocity that the action sets.
+    """Groups of pins; each group translates with a velocity set by the action.
 
     Attributes:
         speed: Largest velocity along an axis [m/s].
@@ -218,11 +219,11 @@ class Velocities(Actuator):
 
 
 class Forces(Actuator):
-    """Forces on groups of vertices, each shared evenly by the vertices of a group.
+    """Forces on groups of vertices; the vertices of a group share its force evenly.
 
     Attributes:
         largest: Force along an axis at an action of 1 [N].
-        steady: Forces [N, 3] that act besides.
+        steady: Additional constant forces on the vertices [N], shape [N, 3].
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], steady: Tensor, *, largest: float) -> None:
@@ -235,7 +236,7 @@ class Forces(Actuator):
     def act(
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
-        """Pull with the same force throughout; see `Actuator`."""
+        """Apply a force that is constant in the transition; see `Actuator`."""
         forces = self.steady.expand_as(state.positions).clone()
         for g, group in enumerate(self._groups):
             share = self.largest / len(group) * actions[:, None, 3 * g : 3 * g + 3]
@@ -274,7 +275,7 @@ class Hand(Actuator):
 
     Attributes:
         speeds: Velocities of the base at actions of 1 [m/s, rad/s], [6].
-        effort: Of each joint at an action of 1 [N or N m]; actions below zero open.
+        effort: Effort of each joint at an action of 1 [N or N m]; negative actions open it.
     """
 
     size = 7

@@ -36,7 +36,7 @@ class BuiltTask(Task):
         sees: "keypoints" or "particles": the vertices that are observed.
     """
 
-    steps: ClassVar[int]  # transitions of an episode, unless told otherwise
+    steps: ClassVar[int]  # default number of transitions of an episode
 
     def __init__(
         self,
@@ -59,8 +59,8 @@ class BuiltTask(Task):
             horizon: Transitions of an episode; by default a fifth more than the script needs.
             substeps: Time steps of a transition, of .02 s each.
             observation: "keypoints" for some vertices, or "particles" for all.
-            material: Of the cloths; None takes that of the task.
-            contact: Options of contact; None takes those of the task.
+            material: Material of the cloths; None means the material of the task.
+            contact: Options of contact; None means the options of the task.
             solver: Options of the solver; a step that fails never raises here.
             integrator: As for `Simulator`.
             frame: Axes of observations and actions: "task", fixed at the start of an episode, or
@@ -99,7 +99,7 @@ class BuiltTask(Task):
 
     @abstractmethod
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
-        """The scene, and what actions move."""
+        """The scene, and its actuator."""
 
     def contact(self) -> ContactOptions:
         """Options of contact, unless others are given."""

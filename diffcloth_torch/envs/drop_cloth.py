@@ -15,15 +15,15 @@ from diffcloth_torch.sim.records.state import State
 
 __all__ = ["DropCloth"]
 
-_CLOSE = 0.1  # of the side: mean distance to flat that succeeds
-_AWAY = 0.06  # how far the goal is from beside the lower edge, along both axes, at most [m]
+_CLOSE = 0.1  # largest mean distance to the flat sheet for success, over the side
+_AWAY = 0.06  # largest offset of the goal from the place beside the lower edge, in each axis [m]
 
 
 class DropCloth(SheetTask):
     """A sheet that two pickers hold by the corners is to lie flat at a goal beside its lower edge.
 
-    The start draws how high the sheet hangs, and the goal. With the mean distance d of the vertices
-    from where they lie in the flat sheet the reward is graded(d, side / 10, side / 2); after
+    The start draws the height of the sheet, and the goal. With the mean distance d of the vertices
+    from their places in the flat sheet, the reward is graded(d, side / 10, side / 2); after
     ClothDrop of SoftGym.
     """
 
@@ -31,7 +31,7 @@ class DropCloth(SheetTask):
     steps = 68
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also how high the lower edge is, 1 to 6 cm, and where the goal is, within 6 cm."""
+        """Also the height of the lower edge, 1 to 6 cm, and the place of the goal, within 6 cm."""
         return super().draw(generator) | {
             "height": uniform(generator, 1, 0.01, 0.06)[0],
             "away": uniform(generator, 2, -_AWAY, _AWAY),
@@ -44,7 +44,7 @@ class DropCloth(SheetTask):
         return torch.stack([torch.zeros_like(x), y, height], dim=-1)
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """Also where the vertices are to lie, and the corners among them."""
+        """Also the goals of all vertices, and of the corners among them."""
         x, y, z = self.flat(len(state)).unbind(dim=-1)
         away = drawn["away"][:, None]
         flat = torch.stack([x + SIDE / 2 + away[..., 0], y + away[..., 1], z], dim=-1)
@@ -70,11 +70,11 @@ class DropCloth(SheetTask):
         return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the mean distance is below .1 of the side."""
+        """Return whether the mean distance is below .1 of the side."""
         return self.distance(env) < _CLOSE * SIDE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Bring the lower edge over its place, lower it, lay the sheet down about it, let go."""
+        """Move the lower edge over its place, lower it, lay the sheet down about it, release."""
         start, flat = env.drawn["start"], env.drawn["flat"]
         picked = env.drawn["picked"]
         edge = cpu.tensor([self.vertex(0, 0), self.vertex(-1, 0)], dtype=torch.int64)
@@ -82,12 +82,12 @@ class DropCloth(SheetTask):
         up = cpu.tensor([0.0, 0.0, SIDE])
         begin = at(start, picked)
         high = torch.cat([foot[..., :2], begin[..., 2:]], dim=-1)
-        # What has been laid down and what still hangs are together as long as the sheet.
+        # The parts that lie and that hang are together as long as the sheet.
         shares = [k / 6 for k in range(7)]
         laid = [foot + (share - 0.03 * (1 - share)) * out + (1.03 - share) * up for share in shares]
         middle = 0.5 * (begin + high)
         points = [begin, middle, middle, high, high, *laid, laid[-1], laid[-1] + 0.1 * up]
-        # The second half of the way begins half a period of the swinging sheet after the first one,
-        # which ends the swinging.
+        # The second half of the way begins half a swing of the sheet after the first half, which
+        # stops the swinging.
         times = [0, 4, 11, 15, 17, *(26 + 4 * k for k in range(7)), 52, 56]
         return self.moves_to(env, *follow(env, times, points, [*[1.0] * 13, -1.0]))

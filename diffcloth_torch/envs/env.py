@@ -1,7 +1,7 @@
 """The core of an environment: a task as pure functions of its state.
 
-Nothing here knows of gymnasium. All functions take batches, of which the environments do not depend
-on each other, and all but drawing a start are differentiable.
+The module does not depend on gymnasium. All functions work on batches of independent environments,
+and all except the random start are differentiable.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class EnvState:
     Attributes:
         state: State of the simulation.
         tools: State of the actuator: positions of pickers and the vertices that they hold.
-        drawn: The random numbers of the start, and quantities that follow from it, such as a goal.
+        drawn: Random numbers of the start, and quantities derived from the start, such as a goal.
         elapsed: Transitions since the start, int64 [B].
-        failed: Whether the simulation failed in the last transition, so that the state is the last
-            one that was reached, [B].
-        blocked: Whether a prescribed motion of the last transition was infeasible and was not made,
+        failed: Whether the simulation failed in the last transition, [B]; the state is then the
+            last state that was reached.
+        blocked: Whether a prescribed motion of the last transition was infeasible and was stopped,
             [B].
         held: Number of transitions, up to the last one, in which the task was done, int64 [B].
     """
@@ -63,7 +63,7 @@ class EnvState:
         return len(self.elapsed)
 
     def detach(self) -> EnvState:
-        """The same without a graph."""
+        """A copy without a graph."""
         return self._map(lambda t: t.detach(), self.state.detach())
 
     @staticmethod
@@ -100,15 +100,16 @@ _COUNTS = ("elapsed", "failed", "blocked", "held")
 class Task(ABC):
     """A task: the distribution of its starts, its tools, its reward and its success.
 
-    Rewards are at least `worst`, which a blocked motion costs; a simulation that fails costs it for
-    each transition that is left. So no failure has a larger return than an episode that goes on.
+    Rewards are at least `worst`, which is the reward of a blocked motion. A failed simulation costs
+    `worst` for its transition and for each remaining transition, so no failure has a larger return
+    than an episode that continues.
 
     Attributes:
-        name: Its name in `make` and, with "diffcloth/" before and "-v0" behind, in gymnasium.
-        worst: The least reward of a transition.
-        holds: Transitions in which a task must be done, up to the last one, to succeed.
-        simulator: The scene, shared by all environments.
-        actuator: What actions move.
+        name: Name of the task in `make`, and "diffcloth/NAME-v0" in gymnasium.
+        worst: The smallest reward of a transition.
+        holds: Number of last transitions in which a task must be done for success.
+        simulator: Simulator of the scene, shared by all environments.
+        actuator: Conversion of actions to controls.
         horizon: Transitions after which an episode ends.
         substeps: Time steps of a transition.
         frame: The axes of observations and actions: "task", fixed at the start of an episode, or
@@ -148,45 +149,45 @@ class Task(ABC):
 
     @abstractmethod
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draw what differs from start to start, for one environment."""
+        """Draw the random quantities of a start, for one environment."""
 
     @abstractmethod
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """The scene and the tools for what was drawn for each environment, [B, ...].
+        """State and tools of the starts with the random quantities `drawn`, [B, ...].
 
-        It may add to `drawn` what rewards need of the start.
+        The method may add quantities of the start to `drawn` that rewards need.
         """
 
     @abstractmethod
     def features(self, env: EnvState) -> Mapping[str, Tensor]:
-        """Name -> what is observed [B, n], in the order of the observation."""
+        """Name -> observed quantity [B, n], in the order of the observation."""
 
     @abstractmethod
     def reward(self, env: EnvState) -> Tensor:
-        """Reward [B] of having come to a state, at least `worst`."""
+        """Reward [B] for reaching a state, at least `worst`."""
 
     @abstractmethod
     def success(self, env: EnvState) -> Tensor:
-        """Whether the task is done in a state [B]; it succeeds where this holds for `holds`."""
+        """Return whether the task is done in a state [B]; success needs `holds` such states."""
 
     def scripted(self, env: EnvState) -> Tensor:  # a task may have none
-        """Actions [B, A] of a policy made by hand, which shows that the task can be done.
+        """Actions [B, A] of a hand-made policy, which shows that the task can be done.
 
         Raises:
-            InvalidInput: If the task has none.
+            InvalidInput: If the task has no scripted policy.
         """
         raise InvalidInput(f"{self.name}: it has no scripted policy")
 
     def frame_of(self, state: State, drawn: Mapping[str, Tensor]) -> Frame | None:
-        """The frame of the task at a start; None where it is the world."""
+        """The frame of the task at a start; None for the world frame."""
         return None
 
     def terminal(self, env: EnvState) -> Tensor:
-        """Whether an episode ends before its horizon [B]: where the simulation failed."""
+        """Return whether an episode ends before its horizon [B]: if the simulation failed."""
         return env.failed
 
     def sample(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draw a start, and physical parameters where they are randomized."""
+        """Draw a start, and physical parameters if they are randomized."""
         return self.draw(generator) | self._randomization.draw(generator)
 
     def initial(self, generator: torch.Generator, n: int) -> EnvState:
@@ -194,7 +195,7 @@ class Task(ABC):
         return self.start([self.sample(generator) for _ in range(n)])
 
     def start(self, draws: list[dict[str, Tensor]]) -> EnvState:
-        """Starts for what was drawn for each environment."""
+        """Starts with the random quantities drawn for each environment."""
         drawn = {name: torch.stack([d[name] for d in draws]) for name in draws[0]}
         with torch.no_grad():
             state, tools = self.place(drawn)
@@ -217,16 +218,16 @@ class Task(ABC):
     ) -> EnvState:
         """The state after `substeps` time steps.
 
-        Where a prescribed motion is infeasible, it ends: the time step is taken again with
-        everything prescribed held, as are the ones that are left of the transition. Their
-        derivative by the action is zero; the derivatives by the state and by parameters are those
-        of the steps. An environment whose simulation fails stays at the last state that it reached,
-        without a graph.
+        An infeasible prescribed motion is stopped: its time step is repeated with all prescribed
+        motion held, and the remaining time steps of the transition are held too. Derivatives of
+        these steps with respect to the action are zero; derivatives with respect to the state and
+        to parameters are kept. An environment whose simulation fails stays at the last state that
+        it reached, without a graph.
 
         Args:
-            env: The state before it.
-            actions: Between -1 and 1, others are clipped, in the frame of the task, float64 [B, A].
-            parameters: Of the simulation; None takes those of the scene.
+            env: State before the transition.
+            actions: Actions in the frame of the task, float64 [B, A], clipped to -1 .. 1.
+            parameters: Parameters of the simulation; None means the parameters of the scene.
         """
         state = env.state
         failed = blocked = torch.zeros_like(env.failed)
@@ -251,10 +252,10 @@ class Task(ABC):
         return replace(after, held=(env.held + 1) * done)
 
     def outcome(self, env: EnvState) -> Tensor:
-        """Reward [B] with the charges for failing.
+        """Reward [B] with the charges for failure.
 
-        A blocked motion costs `worst`; a failed simulation costs it for its transition and for each
-        that is left.
+        The reward of a blocked motion is `worst`; the reward of a failed simulation is `worst`
+        times the number of its transition and all remaining transitions.
         """
         reward = self.reward(env)
         if not bool((env.failed | env.blocked).any()):
@@ -264,11 +265,11 @@ class Task(ABC):
         return torch.where(env.failed | env.blocked, charge.to(reward), reward)
 
     def succeeded(self, env: EnvState) -> Tensor:
-        """Whether the task was done in each of the last `holds` transitions [B]."""
+        """Return whether the task was done in each of the last `holds` transitions [B]."""
         return env.held >= self.holds
 
     def observation(self, env: EnvState) -> Tensor:
-        """What a policy sees, float64 [B, O]: all features, one behind the other."""
+        """Observation of a policy, float64 [B, O]: all features, concatenated."""
         return torch.cat(list(self.features(env).values()), dim=-1)
 
     def in_world(self, env: EnvState, actions: Tensor) -> Tensor:
@@ -308,7 +309,7 @@ class Task(ABC):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """Name of a feature -> its place in an observation."""
+        """Name of a feature -> its slice of an observation."""
         sizes = {n: f.shape[-1] for n, f in self.features(self.example()).items()}
         ends = cpu.tensor(list(sizes.values()), dtype=torch.int64).cumsum(0).tolist()
         return {
@@ -316,19 +317,19 @@ class Task(ABC):
         }
 
     def example(self) -> EnvState:
-        """A start of one environment, which shows the shapes of everything."""
+        """A start of one environment, as an example of all shapes."""
         return self.initial(cpu.generator().manual_seed(0), 1)
 
 
 def graded(distance: Tensor, tolerance: float, length: float) -> Tensor:
-    """Reward [B] between -1 and 1 that grows everywhere, and most where a task is nearly done.
+    """Reward [B] between -1 and 1, with a gradient everywhere that is largest near success.
 
-    It is s(4 (1 - d/t)) - tanh(d/l) with the logistic function s.
+    The reward is s(4 (1 - d/t)) - tanh(d/l) with the logistic function s.
 
     Args:
-        distance: d, from where the task is done [m], [B].
+        distance: d, the distance from success [m], [B].
         tolerance: t, the distance at which a task counts as done [m].
-        length: l, over which distances are told apart [m].
+        length: l, the length over which rewards distinguish distances [m].
     """
     near = torch.sigmoid(4.0 - (4.0 / tolerance) * distance)
     return near - torch.tanh(distance / length)
@@ -341,8 +342,8 @@ def failures(state: State) -> Tensor:
 
 
 def lengths(vectors: Tensor) -> Tensor:
-    """Lengths [...] of vectors [..., n]; those that are zero have no gradient."""
-    # No square root of torch: for a few numbers of float64 it wakes all threads.
+    """Lengths [...] of vectors [..., n]; the gradient of zero vectors is zero."""
+    # Not `torch.sqrt`, which starts all threads even for a few float64 numbers.
     norms: Tensor = torch.linalg.vector_norm(vectors, dim=-1)
     return norms
 

@@ -17,17 +17,17 @@ from diffcloth_torch.sim.records.state import State
 
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
 
-_DRIFT = 1.2  # weight of how far the kept part moves, as in SoftGym
-_CLOSE = 0.1  # in sides: see success()
+_DRIFT = 1.2  # weight of the drift of the kept part, as in SoftGym
+_CLOSE = 0.1  # largest distance for success, over the side
 
 
 class FoldCloth(SheetTask):
-    """A part of a sheet is to lie on the rest of it, which is to stay where it is.
+    """A part of a sheet is to lie on the rest of the sheet, which must not move.
 
-    The start draws which of two opposite edges moves, and the line of the fold: one of the rows of
-    vertices that leave between a fifth and a half of the sheet to be moved. A sheet folds along its
-    edges, so that this serves all sizes. The distance is d = mean distance of the moved material
-    from where it is to lie + 1.2 times the mean drift of the kept material, both by area, after
+    The start draws which of two opposite edges moves, and the line of the fold: a row of vertices
+    such that between a fifth and a half of the sheet is moved. A sheet folds along its mesh edges,
+    so a row of vertices suits all sizes. The distance is d = mean distance of the moved material
+    from its goal + 1.2 times the mean drift of the kept material, both weighted by area, after
     ClothFold of SoftGym and fold_cloth of DaXBench; the reward is graded(d, side / 10, side / 2).
     """
 
@@ -37,12 +37,12 @@ class FoldCloth(SheetTask):
     pace: ClassVar[int] = 3  # transitions for an eighth of the way
 
     def lines(self) -> list[int]:
-        """Columns of vertices along which a sheet may be folded: half of it to four fifths stay."""
+        """Columns of vertices of possible folds: between half and four fifths of the sheet stay."""
         n = self.side
         return [c for c in range(n - 1) if 0.5 <= c / (n - 1) <= 0.8]
 
     def beyond(self, row: Tensor, column: Tensor, line: int) -> Tensor:
-        """How far vertices are beyond a line, in rows of vertices."""
+        """Signed distance of vertices beyond a line, in rows of vertices."""
         return column - line
 
     def mirror(self, row: Tensor, column: Tensor, line: int) -> tuple[Tensor, Tensor]:
@@ -61,7 +61,7 @@ class FoldCloth(SheetTask):
     def _tables(self) -> dict[str, Tensor]:
         """For both edges and all lines: partners of vertices, their areas, and picked vertices.
 
-        A sheet that is turned by half a turn has the same triangles: vertex i becomes N - 1 - i.
+        A half turn maps the triangles of the sheet to themselves: vertex i becomes N - 1 - i.
         """
         n, count = self.side, self.side**2
         index = cpu.arange(count)
@@ -101,7 +101,7 @@ class FoldCloth(SheetTask):
         return self._tables["picked"][drawn["edge"]]
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """Also which material is to lie on which, and where the picked vertices are to lie."""
+        """Also the vertices that moved material is to lie on, and goals of picked vertices."""
         edge, line = drawn["edge"], drawn["line"]
         drawn["partner"] = self._tables["partner"][edge, line]
         drawn["area"] = self._tables["area"][edge, line]
@@ -109,7 +109,7 @@ class FoldCloth(SheetTask):
         return super().started(state, drawn)
 
     def distance(self, env: EnvState) -> Tensor:
-        """Of moved material from its goal, and 1.2 times the drift of kept material [m], [B]."""
+        """Distance of moved material from its goal + 1.2 drift of kept material [m], [B]."""
         x = env.state.positions
         away = torch.stack([x - at(x, env.drawn["partner"]), x - env.drawn["start"]], dim=1)
         apart, drift = (lengths(away) * env.drawn["area"]).sum(dim=-1).unbind(dim=1)
@@ -120,11 +120,11 @@ class FoldCloth(SheetTask):
         return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the distance is below a tenth of the side."""
+        """Return whether the distance is below a tenth of the side."""
         return self.distance(env) < _CLOSE * SIDE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close on the corners, carry them over in an arc, put them down, let go."""
+        """Close on the corners, move them over in an arc, put them down, release."""
         low = cpu.tensor([0.0, 0.0, 0.016])
         here, there = at(env.drawn["start"], env.drawn["picked"]), env.drawn["goal"] + low
         carried = arc(here, there, self.lift(), 8)
@@ -141,11 +141,11 @@ class FoldCloth(SheetTask):
 
 
 class FoldClothDiagonal(FoldCloth):
-    """A triangle of a sheet is to lie on the rest of it.
+    """A triangle of a sheet is to lie on the rest of the sheet.
 
     The start draws which of two opposite corners moves, and the line of the fold, parallel to the
-    diagonal between the others. One picker carries the corner; the other begins in the middle of
-    the moved triangle. Distance and reward as in `FoldCloth`.
+    diagonal between the other corners. One picker carries the corner; the other begins in the
+    middle of the moved triangle. Distance and reward are as in `FoldCloth`.
     """
 
     name = "FoldClothDiagonal"
@@ -166,11 +166,11 @@ class FoldClothDiagonal(FoldCloth):
         return column - line, row + line
 
     def lift(self) -> float:
-        """See `FoldCloth`; a finer sheet that is pulled taut drags the rest along."""
+        """See `FoldCloth`; lower for fine sheets, which drag the kept part along if taut."""
         return 0.4 if self.side <= 16 else 0.3
 
     def corners(self) -> list[int]:
-        """The corner, and a vertex half way to the middle."""
+        """The corner, and a vertex halfway to the middle."""
         quarter = self.side // 4
         return [self.vertex(0, -1), self.vertex(quarter, -1 - quarter)]
 

@@ -1,9 +1,9 @@
 """Frames of tasks: axes and origins of observations and actions, fixed at the start of an episode.
 
 A frame is three entries among the quantities of a start: "frame_origin" [B, 3], "frame_turn" [B, 4]
-(a quaternion), and "frame_axes"
-[B, 3, 3], whose rows are its axes in the world. Sums instead of matrix products keep the bits of an
-environment in any batch. Without these entries the frame is the world, and nothing is computed.
+(a quaternion), and "frame_axes" [B, 3, 3], whose rows are its axes in the world. Sums are used
+instead of matrix products, whose rounding would depend on the size of the batch. Without these
+entries the frame is the world, and functions return their argument.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ def level_frame(origin: Tensor, direction: Tensor) -> Frame:
     """A frame with z upwards.
 
     Args:
-        origin: [B, 3].
-        direction: Of its x axis, horizontal unit vectors [B, 2].
+        origin: Origin of the frame [m], shape [B, 3].
+        direction: Direction of the x axis, horizontal unit vectors [B, 2].
     """
     x, y = direction.unbind(dim=-1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     rows = torch.stack([x, y, zero, -y, x, zero, zero, zero, one], dim=-1)
-    half = torch.stack([1 + x, zero, zero, y], dim=-1)  # of the turn, not yet of length 1
+    half = torch.stack([1 + x, zero, zero, y], dim=-1)  # quaternion of the rotation, not normalized
     turn = half / torch.linalg.vector_norm(half, dim=-1, keepdim=True)
     return _frame(origin, rows.reshape(-1, 3, 3), turn)
 

@@ -29,8 +29,8 @@ _AUTORESETS = (AutoresetMode.SAME_STEP.value, AutoresetMode.DISABLED.value)
 _RENDER_MODES = ("rgb_array",)
 _PICTURE = (480, 360)  # width and height [pixels]
 _LARGEST_SEED = 2**64 - 1
-_FLAGS = ("success", "failed", "blocked", "elapsed")  # of an episode that ended
-_FLOAT = torch.float32  # at the border; float64 inside
+_FLAGS = ("success", "failed", "blocked", "elapsed")  # entries of "final_info"
+_FLOAT = torch.float32  # type of observations and rewards; float64 inside
 
 
 class ClothVectorEnv(VectorEnv[Any, Any, Any]):
@@ -39,23 +39,24 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
     Observations and rewards are float32 tensors [B, O] and [B]. They keep the graph of actions that
     need a gradient, through as many steps as have been taken since `clear_grad`; where nothing
     needs one there is no graph. `info` has "success", "failed", "blocked" and "elapsed", [B] each,
-    and "obs_before_reset", the observation at the end of the step. Success is a task that was done
+    and "obs_before_reset", the observation at the end of the step. A task succeeds if it was done
     in the last `Task.holds` steps.
 
     A prescribed motion that is infeasible is blocked, as by a safety stop: `info["blocked"]`. Its
     reward is `Task.worst`, and the derivative by the action is zero. An episode ends at the horizon
-    of the task (`truncated`), or where the simulation fails (`terminated`, with `info["failed"]`):
-    the reward is then `Task.worst` for this step and for each that is left, without a gradient.
-    With `AutoresetMode.SAME_STEP` a new episode begins in the step that ends one: the observation
-    is that of the new start, and `info["final_obs"]` that of the end, with its graph, where
-    `info["_final_obs"]` is true. With `AutoresetMode.DISABLED` it is begun by
-    `reset(options={"reset_mask": ended})`.
+    of the task (`truncated`), or if the simulation fails (`terminated`, with `info["failed"]`): the
+    reward is then `Task.worst` for this step and each remaining step, without a gradient.
+    With `AutoresetMode.SAME_STEP` a new episode begins in the step that ends one: the step returns
+    the observation of the new start, and `info["final_obs"]` is the observation of the end, with
+    its graph, if `info["_final_obs"]` is true. With `AutoresetMode.DISABLED`, a new episode is
+    started by `reset(options={"reset_mask": ended})`.
 
-    Environment i starts from numbers of its own, which depend on the seed and on i alone.
+    Environment i draws its starts from random numbers that depend only on the seed and on i.
 
     Attributes:
-        task: What is to be done.
-        parameters: Of the simulation, for gradients and for variation; None for those of the scene.
+        task: The task.
+        parameters: Parameters of the simulation, for gradients and for variation; None for the
+            parameters of the scene.
         env_state: The present state, with its graph.
     """
 
@@ -74,9 +75,9 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         """Prepare the environments; `reset` starts them.
 
         Args:
-            task: What is to be done.
+            task: The task.
             num_envs: B, the number of environments.
-            seed: Of the first `reset` that gives none.
+            seed: Seed of the first `reset` without a seed.
             autoreset_mode: SAME_STEP or DISABLED.
             render_mode: "rgb_array" for pictures by `render`, by the extra "viewer"; None for none.
 
@@ -135,7 +136,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observe(self.env_state), self._info(self.env_state)
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Take a transition in all environments.
+        """Make a transition in all environments.
 
         Args:
             actions: [B, A], between -1 and 1; others are clipped.
@@ -186,7 +187,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_start("render")
         state = self.env_state.state.detach()
         if self._snapshots is None:
-            # Drawing needs packages that environments without pictures do not.
+            # Only pictures need the packages of the viewers.
             from diffcloth_torch.viewers.look import Camera
             from diffcloth_torch.viewers.snapshots import Snapshots
 
@@ -206,16 +207,16 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.env_state = self.env_state.detach()
 
     def initialize_trajectory(self) -> Tensor:
-        """Cut the graph, and give the observation [B, O] to go on from."""
+        """Cut the graph, and return the observation [B, O] of the present state."""
         self.clear_grad()
         return self._observe(self.env_state)
 
     def generator_states(self) -> list[Tensor]:
-        """States of the generators of starts, to go on with later: see `resume`."""
+        """States of the generators of starts, for `resume`."""
         return [generator.get_state() for generator in self._generators or []]
 
     def resume(self, env_state: EnvState, generator_states: Sequence[Tensor]) -> Tensor:
-        """Go on from a state and generators that were kept; gives the observation [B, O]."""
+        """Continue from a saved state and saved generators; return the observation [B, O]."""
         known: object = env_state
         if not isinstance(known, EnvState):
             raise TypeError(f"resume: `env_state` must be an EnvState, got {type(known).__name__}")
@@ -268,7 +269,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         chosen = mask.nonzero()[:, 0].tolist()
         if not chosen:
             return env
-        # Only these draw, so that others do not depend on when these end.
+        # Only the generators of ended environments draw, so environments stay independent.
         fresh = self._started(chosen)
         rows = cpu.zeros(self.num_envs, dtype=torch.int64)
         rows[chosen] = cpu.arange(len(chosen))
@@ -320,7 +321,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 def _tried(task: Task) -> int:
-    """Try what a task computes on one start; gives the size of its observations."""
+    """Test the functions of a task on one start; return the size of its observations."""
     example = task.example()
     features: Any = task.features(example)
     if not isinstance(features, Mapping):
@@ -361,7 +362,7 @@ def _check(
 
 
 def _check_rewards(task: Task, reward: Tensor, env: EnvState) -> None:
-    """Require rewards of at least `worst`, but for those that charge the rest of an episode."""
+    """Require rewards of at least `worst`, except at an end that charges remaining steps."""
     right = (reward >= task.worst) & (reward < math.inf)
     if bool(right.all()):
         return
@@ -383,7 +384,7 @@ def check_render_mode(owner: str, mode: str | None) -> str | None:
 
 
 def register(name: str) -> None:
-    """Let `gymnasium.make` and `make_vec` find a task as "diffcloth/NAME-v0"."""
+    """Register a task for `gymnasium.make` and `make_vec` as "diffcloth/NAME-v0"."""
     gymnasium.register(
         f"diffcloth/{name}-v0",
         entry_point="diffcloth_torch.envs:make_single",

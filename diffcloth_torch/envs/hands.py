@@ -28,7 +28,7 @@ from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
 __all__ = ["LENGTH", "GraspCloth", "HandTask", "LiftCloth", "twist_to"]
 
-LENGTH = 0.12  # of a side of the cloth [m]
+LENGTH = 0.12  # length of a side of the cloth [m]
 _JOINTS = ("gripper/left_finger_joint", "gripper/right_finger_joint")
 _CLOSING = 5  # transitions in which a scripted hand closes
 
@@ -37,8 +37,8 @@ class HandTask(BuiltTask):
     """A cloth lies on a table and over its edge, between the fingers of a gripper.
 
     Actions are the linear and angular velocity of the gripper's base and the effort of its fingers.
-    The start draws where the gripper is, within 4 mm. The frame of the task is the pose of the base
-    at the start.
+    The start draws the position of the gripper, within 4 mm. The frame of the task is the pose of
+    the base at the start.
 
     Attributes:
         center: Position of the cloth's center at the start [m], [3].
@@ -67,7 +67,7 @@ class HandTask(BuiltTask):
         return (*rise, 0.0, 0.0, 0.0, 0.95)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Where the gripper is, within 4 mm."""
+        """The position of the gripper, within 4 mm."""
         return {"shift": uniform(generator, 3, -0.004, 0.004)}
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
@@ -108,7 +108,7 @@ class HandTask(BuiltTask):
         }
 
     def towards(self, env: EnvState, twist: Tensor, closing: int = _CLOSING) -> Tensor:
-        """Actions that close the fingers, and then move by a twist [B, 6] as far as they go."""
+        """Actions that close the fingers, then move by a twist [B, 6] within the limits."""
         duration = self.substeps * DT
         moves = (twist / (duration * self.hand.speeds)).reshape(-1, 2, 3)
         moves = vectors_in(env.drawn, moves).flatten(1)
@@ -134,7 +134,7 @@ class LiftCloth(HandTask):
         return super().draw(generator) | {"goal": (goal + uniform(generator, 3, -0.04, 0.04))[None]}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Also the way that the center of the cloth has yet to go, in sides."""
+        """Also the remaining displacement of the cloth's center to the goal, in sides."""
         away = vectors_in(env.drawn, self._away(env)[:, None])[:, 0] / LENGTH
         return super().features(env) | {"to_goal": away}
 
@@ -143,7 +143,7 @@ class LiftCloth(HandTask):
         return graded(self.distance(env), self._CLOSE, LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the center of the cloth is within a sixth of its side of the goal."""
+        """Return whether the center of the cloth is within a sixth of its side of the goal."""
         return self.distance(env) < self._CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
@@ -162,9 +162,9 @@ class LiftCloth(HandTask):
 class GraspCloth(HandTask):
     """A gripper brings a cloth upright into a target shape.
 
-    The start draws the target: the cloth hangs from the edge that is held, at a place within 3 cm
-    along each axis, turned about the vertical by up to .3 rad. With the mean distance d of the
-    vertices from it the reward is graded(d, side / 8, side); the task of the paper, section V.D.3.
+    The start draws the target: the cloth hangs from the held edge, moved by up to 3 cm along each
+    axis and rotated about the vertical by up to .3 rad. With the mean distance d of the vertices
+    from the target, the reward is graded(d, side / 8, side); the task of the paper, section V.D.3.
     """
 
     name = "GraspCloth"
@@ -206,17 +206,17 @@ class GraspCloth(HandTask):
         return graded(self.distance(env), self._CLOSE, LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the mean distance is below an eighth of the side."""
+        """Return whether the mean distance is below an eighth of the side."""
         return self.distance(env) < self._CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close, then move the hand as the cloth has to move."""
+        """Close, then move the hand rigidly with the required motion of the cloth."""
         base, target = env.state.base_poses[:, 0], env.drawn["target_base"]
         return self.towards(env, 0.15 * twist_to(base, target))
 
 
 def twist_to(base: Tensor, target: Tensor) -> Tensor:
-    """Translation and rotation vector [B, 6] from poses [B, 7] to others."""
+    """Translation and rotation vector [B, 6] from base poses [B, 7] to target poses."""
     inverse = base[:, 3:] * cpu.tensor([1.0, -1.0, -1.0, -1.0])
     turn = quaternion_log(quaternion_multiply(target[:, 3:], inverse))
     return torch.cat([target[:, :3] - base[:, :3], turn], dim=-1)

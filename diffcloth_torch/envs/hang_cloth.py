@@ -1,4 +1,4 @@
-"""Hang a cloth over two pegs, and let go."""
+"""Hang a cloth over two pegs, and release it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from diffcloth_torch.sim.records.state import State
 __all__ = ["HangCloth"]
 
 _PEGS = cpu.tensor([0.3, 0.0, 0.2])  # mean place between the pegs [m]
-_ASIDE = 0.045  # of a peg from there, along y [m]
-_TIP = 0.075  # from the frame of the hand to between its fingers [m]
-_FREE = 0.09  # distance of the nearest vertex from the frame of a hand that has let go [m]
+_ASIDE = 0.045  # distance of a peg from that place, along y [m]
+_TIP = 0.075  # distance from the frame of the hand to the middle between its fingertips [m]
+_FREE = 0.09  # distance of the nearest vertex from the frame of a hand that released the cloth [m]
 _CLOSE = LENGTH / 4
-_SECONDS = 0.2  # distance that a velocity is worth [s]
+_SECONDS = 0.2  # weight of the speed of the cloth as a distance [s]
 
 
 def _peg(name: str, y: float) -> RigidBody:
-    """A short capsule across the way of the hand, which passes between two of them."""
+    """A short capsule across the way of the hand, which passes between two pegs."""
     x, _, z = _PEGS.tolist()
     across = [0.5**0.5, 0.5**0.5, 0, 0]
     return RigidBody.capsule(
@@ -35,12 +35,13 @@ def _peg(name: str, y: float) -> RigidBody:
 
 
 class HangCloth(HandTask):
-    """A gripper hangs a cloth over two pegs of rubber, and lets it go.
+    """A gripper hangs a cloth over two rubber pegs, and releases it.
 
-    The start draws where the pegs are: within 4.5 cm along x, and 3 cm along y and z. The reward is
-    graded(d, side / 4, 2 sides), where d is the distance of the cloth's center from between the
-    pegs, and up to side / 4 for a hand that holds it, and .2 s times the speed of the cloth: a
-    cloth that is let go and stays there succeeds. After the hanging tasks of GarmentLab.
+    The start draws the place of the pegs: within 4.5 cm along x, and 3 cm along y and z. The reward
+    is graded(d, side / 4, 2 sides). The distance d is the sum of the distance of the cloth's center
+    from the middle between the pegs, up to side / 4 for a hand that holds the cloth, and .2 s times
+    the speed of the cloth: a cloth that is released and stays there succeeds. After the hanging
+    tasks of GarmentLab.
     """
 
     name = "HangCloth"
@@ -48,7 +49,7 @@ class HangCloth(HandTask):
     obstacles = (_peg("left_peg", _ASIDE), _peg("right_peg", -_ASIDE))
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also where the pegs are."""
+        """Also the place of the pegs."""
         spread = cpu.tensor([0.045, 0.03, 0.03])
         return super().draw(generator) | {"away": spread * uniform(generator, 3, -1.0, 1.0)}
 
@@ -67,12 +68,12 @@ class HangCloth(HandTask):
         return state.replace(body_poses=poses), tools
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Also the way that the center of the cloth has yet to go, in sides."""
+        """Also the remaining displacement of the cloth's center to the goal, in sides."""
         away = vectors_in(env.drawn, self._away(env)[:, None])[:, 0] / LENGTH
         return super().features(env) | {"to_goal": away}
 
     def amiss(self, env: EnvState) -> Tensor:
-        """Distance from where the cloth is to hang, with charges for holding and moving it [m]."""
+        """Distance of the cloth from its goal, with charges for holding and for motion [m]."""
         state = env.state
         hand = state.base_poses[:, :1, :3]
         nearest = lengths(state.positions - hand).amin(dim=-1)
@@ -85,11 +86,11 @@ class HangCloth(HandTask):
         return graded(self.amiss(env), _CLOSE, 2 * LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the cloth hangs on the pegs, at rest, and nothing else holds it."""
+        """Return whether the cloth hangs on the pegs, at rest, and nothing else holds it."""
         return self.amiss(env) < _CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close, lift and turn down, pass between the pegs, sink behind them, let go, rise."""
+        """Close, lift and turn down, pass between the pegs, sink behind them, release, rise."""
         steps, tips = zip(*_PATH, strict=True)
         pegs = env.drawn["pegs"][:, None] + cpu.tensor([0.0, 0.0, _TIP])
         path = [pegs + cpu.tensor(tip) for tip in tips]
@@ -103,7 +104,8 @@ class HangCloth(HandTask):
         moves = self.towards(
             env, torch.where(risen, 0.5 * twist_to(base, target), rise), _ALIGNED + 5
         )
-        # All cloths are held equally deep, and in the middle between the fingers.
+        # The hand aligns with the cloth, to hold all cloths equally deep and in the middle between
+        # the fingers.
         edge = env.drawn["start"][:, self._corners[::2]].mean(dim=1) + cpu.tensor(_GRIP)
         grip = torch.cat([edge - base[:, :3], cpu.zeros(len(env), 3)], dim=-1)
         aligns = (env.elapsed < _ALIGNED)[:, None]
@@ -114,8 +116,8 @@ class HangCloth(HandTask):
         return env.drawn["goal"][:, 0] - env.state.positions.mean(dim=1)
 
 
-# Transitions, and where the tip of the hand should then be from between the pegs [m]. With the tip
-# 2.8 cm beyond them the middle of the cloth lies on the pegs.
+# Transitions, and the wanted position of the hand's tip then, from the middle between the pegs [m].
+# With the tip 2.8 cm beyond the pegs, the middle of the cloth lies on them.
 _PATH = (
     (34, (-0.15, 0.0, 0.1)),
     (48, (-0.05, 0.0, 0.06)),
@@ -126,8 +128,8 @@ _PATH = (
     (116, (0.028, 0.0, 0.12)),
 )
 _RELEASE = 84
-_AJAR = 0.5  # effort with which fingers open by 1.7 cm each: further ones would push the cloth
-_RISEN = 16  # transitions after which the hand may turn: it has left the table
-_ALIGNED = 4  # transitions in which the hand moves to where it closes
-_CLOSED = 9  # and after which it has closed
-_GRIP = (-0.058, 0.0, 0.0)  # of its base from the edge of the cloth [m]
+_AJAR = 0.5  # effort that opens each finger by 1.7 cm; wider fingers would push the cloth
+_RISEN = 16  # transitions after which the hand may turn, as it is above the table
+_ALIGNED = 4  # transitions in which the hand moves to the place where it closes
+_CLOSED = 9  # transitions after which the hand is closed
+_GRIP = (-0.058, 0.0, 0.0)  # position of the hand's base from the edge of the cloth [m]

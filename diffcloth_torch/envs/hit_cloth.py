@@ -1,4 +1,4 @@
-"""A cuboid swings a hanging sheet up, so that it lies on it."""
+"""A cuboid swings a hanging sheet up, until the sheet lies on the cuboid."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
 __all__ = ["HitCloth"]
 
-_LENGTH = 1.0  # of a side of the sheet [m]
-_CLOSE = 0.08 * _LENGTH  # mean distance to the target that succeeds
+_LENGTH = 1.0  # length of a side of the sheet [m]
+_CLOSE = 0.08 * _LENGTH  # largest mean distance to the target for success [m]
 _TARGETS = (50.0, 90.0)  # angles of the target from the hanging sheet [degrees]
-_UNDER = 0.025  # from the plane of the target to the center of the cuboid that bears it [m]
+_UNDER = 0.025  # distance of the target's plane from the center of a cuboid that supports it [m]
 
-# A path of the cuboid that swings the sheet up to 90 degrees: where its center is from where it
-# would bear a sheet at its angle, y and z [m], and the angle [rad], every .1 s.
+# A path of the cuboid that swings the sheet up to 90 degrees, every .1 s: y and z of its center [m]
+# and its angle [rad]. `_path` uses the offset from the center that supports a sheet at that angle.
 _PATH = (
     (0.053, 0.9, 0.22), (0.163, 0.924, 0.45), (0.265, 0.99, 0.67), (0.354, 1.08, 0.9),
     (0.425, 1.19, 1.12), (0.47, 1.3, 1.32), (0.491, 1.39, 1.46), (0.499, 1.44, 1.54),
@@ -34,10 +34,10 @@ _PATH = (
 
 
 class HitCloth(BuiltTask):
-    """A kinematic cuboid hits a hanging sheet, so that it lies flat on it, behind its pins.
+    """A kinematic cuboid hits a hanging sheet, which is to lie flat on it, behind its pins.
 
-    The start draws how far the cuboid is, and the angle by which the sheet is to be turned about
-    its pins, 50 to 90 degrees. With the mean distance d of the vertices from there the reward is
+    The start draws the distance of the cuboid, and the target angle of the sheet about its pins, 50
+    to 90 degrees. With the mean distance d of the vertices from the target, the reward is
     graded(d, .08 sides, .5 sides); the task of the paper, section V.D.1. The frame is the world.
     """
 
@@ -57,7 +57,7 @@ class HitCloth(BuiltTask):
         return Scene([sheet], scene.bodies), self.actuator
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """How far the cuboid is from the sheet, up to 4 cm more, and the angle of the target."""
+        """The additional distance of the cuboid, up to 4 cm, and the angle of the target."""
         low, high = (math.radians(degrees) for degrees in _TARGETS)
         return {
             "away": uniform(generator, 1, 0.0, 0.04)[0],
@@ -81,7 +81,7 @@ class HitCloth(BuiltTask):
         return state.replace(body_poses=poses), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of the sheet, what they still have to go, the cuboid, and the angle."""
+        """Some vertices of the sheet, their way to the target, the cuboid, and the angle."""
         positions = env.state.positions[:, self._rows]
         return {
             "positions": positions.flatten(1),
@@ -101,11 +101,11 @@ class HitCloth(BuiltTask):
         return graded(self.distance(env), _CLOSE, 0.5 * _LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the mean distance is below .08 sides."""
+        """Return whether the mean distance is below .08 sides."""
         return self.distance(env) < _CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Swing the cuboid along a path made by hand, up to the angle of the target."""
+        """Swing the cuboid along a hand-made path, up to the angle of the target."""
         duration = self.substeps * DT
         path = self._path(env.drawn["angle"])
         times = [0.1 * (k + 1) / duration for k in range(len(_PATH))]
@@ -125,7 +125,7 @@ class HitCloth(BuiltTask):
         return torch.cat([self._bearing(angles) + behind, angles[..., None]], dim=-1)
 
     def _bearing(self, angle: Tensor) -> Tensor:
-        """Center (y, z) [..., 2] of a cuboid that bears the middle of a sheet."""
+        """Center (y, z) [..., 2] of a cuboid that supports the middle of a sheet."""
         sine, cosine = angle.sin(), angle.cos()
         half = _LENGTH / 2
         return torch.stack(

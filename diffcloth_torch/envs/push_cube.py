@@ -20,16 +20,16 @@ from diffcloth_torch.tasks.scenes import grid_changes, scene_of, sections_of
 
 __all__ = ["PushCube"]
 
-_GAP = 0.004  # below the cube, at least [m]
-_SPEED = 0.4  # of the pins [m/s]
+_GAP = 0.004  # smallest gap below the cube [m]
+_SPEED = 0.4  # speed of the pins [m/s]
 _BRAKING = 0.15  # time in which a scripted cube comes to rest [s]
-_CLOSE = 0.03  # distance to the target that succeeds, a tenth of the sheet [m]
+_CLOSE = 0.03  # largest distance to the target for success, a tenth of the sheet [m]
 
 
 class PushCube(BuiltTask):
-    """The two upper corners of a hanging sheet move, so that it pushes a cube to a target.
+    """The two upper corners of a hanging sheet move, and the sheet pushes a cube to a target.
 
-    The start draws where the cube stands, within 2 cm, and its target, within 5 cm along both axes.
+    The start draws the place of the cube, within 2 cm, and its target, within 5 cm along both axes.
     With the distance d of the cube's center from the target the reward is
     graded(d, side / 10, side / 2); the task of the paper, section V.D.2. The frame of the task is
     the cube at the start, with x to its target.
@@ -43,7 +43,7 @@ class PushCube(BuiltTask):
         size = self.side
         section = sections_of("push_cube")["scene"]
         self._length, self._cube = (section[k][0]["shape"]["size"] for k in ("cloths", "bodies"))
-        # Outside of the barrier, whose default is a tenth of an edge.
+        # The cube starts outside of the barrier, whose default distance is a tenth of an edge.
         gap = max(_GAP, 0.1 * self._length / (size - 1))
         scene, _ = scene_of(
             "push_cube",
@@ -67,7 +67,7 @@ class PushCube(BuiltTask):
         return along * (self.action_size // 3)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Where the cube stands, within 2 cm, and its target, within 5 cm."""
+        """The place of the cube, within 2 cm, and its target, within 5 cm."""
         return {
             "cube": uniform(generator, 2, -0.02, 0.02),
             "target": cpu.tensor([0.0, 0.22]) + uniform(generator, 2, -0.05, 0.05),
@@ -87,7 +87,7 @@ class PushCube(BuiltTask):
         return level_frame(state.body_poses[:, 0, :3], drawn["way"])
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Pins, some vertices of the sheet, the cube and what it still has to go."""
+        """Pins, some vertices of the sheet, the cube and its remaining way to the target."""
         state, rows, drawn = env.state, self._rows, env.drawn
         away = torch.nn.functional.pad(self._away(env), (0, 1))[:, None]
         points = [state.positions[:, self._pins], state.positions[:, rows]]
@@ -111,7 +111,7 @@ class PushCube(BuiltTask):
         return graded(self.distance(env), _CLOSE, 0.5 * self._length)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the cube is within 3 cm of the target."""
+        """Return whether the cube is within 3 cm of the target."""
         return self.distance(env) < _CLOSE
 
     def distance(self, env: EnvState) -> Tensor:
@@ -119,14 +119,14 @@ class PushCube(BuiltTask):
         return lengths(self._away(env))
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Push the cube with the sheet across the way to the target, and step back in time."""
+        """Push the cube with the sheet across the way to the target, and move back early enough."""
         away, way = self._away(env), env.drawn["way"]
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
         distance = lengths(away)[:, None]
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * way).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
-        to_target = torch.where(pushes, to_target, way)  # one that is passed is behind
+        to_target = torch.where(pushes, to_target, way)  # a target that is passed lies behind
         middle = cube + torch.where(pushes, 0.04, -self._cube) * to_target
         across = 0.5 * self._length * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
         goals = torch.stack([middle - across, middle + across], dim=1)

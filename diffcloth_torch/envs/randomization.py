@@ -1,4 +1,4 @@
-"""Physical parameters that are drawn at each start, by name."""
+"""Random physical parameters for each start, by name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from diffcloth_torch.sim.simulator import Simulator
 __all__ = ["RANDOMIZED", "Randomization", "Ranges"]
 
 Ranges = bool | Mapping[str, tuple[float, float]] | None
-"""Whether to draw all parameters, or the ranges of some by name."""
+"""True to draw all parameters, or ranges of single parameters by name."""
 
 _FIELDS = {
     "stretch": "stretch",
@@ -39,16 +39,17 @@ _MULTIPLES = {
     "friction": (0.7, 1.4),
     "mass": (0.7, 1.4),
 }
-_DRAG = (0.0, 1.5)  # that of all, as the materials of most scenes have none
+_DRAG = (0.0, 1.5)  # values, not multiples, as the materials of most scenes have no drag
 _PREFIX = "random_"
 
 
 class Randomization:
     """Draws physical parameters for each start of an environment.
 
-    Ranges are of values: [N/m], [N m], [kg/m^2], [-], [-] and [kg] for stretch, bending, density,
-    friction (of all pairs of surfaces), drag (normal) and mass (of each dynamic body, whose inertia
-    scales with it). Those whose lower bound is positive are drawn evenly in their logarithm.
+    Ranges have the units of values: [N/m], [N m], [kg/m^2], [-], [-] and [kg] for stretch, bending,
+    density, friction (of all pairs of surfaces), drag (normal) and mass (of each dynamic body,
+    whose inertia scales with its mass). A parameter is drawn uniformly in its logarithm if its
+    lower bound is positive, and uniformly in its value otherwise.
     """
 
     def __init__(self, owner: str, simulator: Simulator, ranges: Ranges) -> None:
@@ -85,7 +86,7 @@ class Randomization:
         self._defaults = {name: getattr(defaults, name) for name in fields}
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """One number for each parameter: its value, or multiple of that of the scene."""
+        """One number for each parameter: its value, or a multiple of the scene's value."""
         drawn = {}
         for name, (low, high) in self._ranges.items():
             share = cpu.rand(1, generator=generator)[0]
@@ -98,10 +99,10 @@ class Randomization:
     def parameters(
         self, drawn: Mapping[str, Tensor], given: Parameters | None = None
     ) -> Parameters | None:
-        """Parameters of a step, with those that were drawn; `given` ones where none are.
+        """Parameters of a step: the drawn parameters, and `given` for all others.
 
         Raises:
-            InvalidInput: If one is given and drawn.
+            InvalidInput: If a parameter is both given and drawn.
         """
         if not self._ranges:
             return given
@@ -118,7 +119,7 @@ class Randomization:
         return given.replace(**fields)
 
     def _fields(self, name: str, drawn: Tensor) -> dict[str, Tensor]:
-        """Fields of parameters for numbers [B]."""
+        """Fields of `Parameters` for drawn numbers [B]."""
         default = self._defaults[_FIELDS[name]]
         if name == "mass":
             masses = torch.where(

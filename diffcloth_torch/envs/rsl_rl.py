@@ -1,4 +1,4 @@
-"""The same environments with the interface that rsl_rl expects, without gradients."""
+"""Environments with the interface of rsl_rl, without gradients."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ __all__ = ["RslRlEnv"]
 
 
 class RslRlEnv:
-    """What `rsl_rl.env.VecEnv` (3.0 and later) asks for; observations are in the group "policy".
+    """Interface of `rsl_rl.env.VecEnv` (3.0 and later); observations are in the group "policy".
 
     Attributes:
-        num_envs: B.
-        num_actions: A.
-        max_episode_length: Steps of an episode.
+        num_envs: B, the number of environments.
+        num_actions: A, the length of an action.
+        max_episode_length: Number of steps of an episode.
         device: The CPU.
-        cfg: Nothing.
+        cfg: An empty dict.
     """
 
     def __init__(self, env: ClothVectorEnv, *, seed: int | None = None) -> None:
-        """Take environments that begin anew by themselves, and begin."""
+        """Wrap environments that restart in the step in which they end, and start them."""
         self.env = begins_anew("RslRlEnv: `env`", env)
         self.num_envs, self.num_actions = env.num_envs, env.task.action_size
         self.max_episode_length = env.task.horizon
@@ -36,7 +36,7 @@ class RslRlEnv:
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Steps since each environment began [B]; a runner may begin with random ones."""
+        """Steps since the start of each episode [B]; a runner may set random numbers at first."""
         return self.env.env_state.elapsed
 
     @episode_length_buf.setter
@@ -48,7 +48,7 @@ class RslRlEnv:
         return TensorDict({"policy": self._observation}, [self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Observations, rewards [B], whether episodes have ended [B], and more."""
+        """Return observations, rewards [B], whether episodes have ended [B], and extras."""
         with torch.no_grad():
             self._observation, reward, terminated, truncated, info = self.env.step(actions)
         extras = {

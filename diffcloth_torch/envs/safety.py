@@ -1,8 +1,8 @@
-"""Time steps that a safety stop guards: a motion that cannot be made is not made.
+"""Time steps with a safety stop: infeasible prescribed motions are held.
 
-Where a prescribed motion is infeasible, the time step is taken again from its start with everything
-prescribed held, as a robot with a safety stop does. This is feasible, as the step begins without an
-intersection.
+If a prescribed motion is infeasible, the time step is repeated from its start with all prescribed
+motion held, as by the safety stop of a robot. The repeated step is feasible, because its start has
+no intersection.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ __all__ = ["SafetyStop"]
 _INFEASIBLE = "infeasible_motion"
 _PRESCRIBED = ("pins", "body_poses", "base_poses", "joint_positions", "joint_velocities")
 _BY_VERTEX = ("pins", "soft_pins", "attachments", "attachment_weights")
-_MOST_ITERATIONS = 200  # of a step in which all is held; single steps need 5 to 40
+_MOST_ITERATIONS = 200  # limit for a step with all prescribed motion held; steps need 5 to 40
 
 
 class SafetyStop:
-    """Takes time steps of a batch, and holds what cannot move as prescribed.
+    """Time steps of a batch, with infeasible prescribed motions held.
 
     Attributes:
-        simulator: Takes the steps.
-        holding: The same with a limit of iterations of its own: takes steps in which all is held.
+        simulator: Simulator of the steps.
+        holding: Simulator of steps with all prescribed motion held, with a lower limit of
+            iterations.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -53,16 +54,16 @@ class SafetyStop:
     def step(
         self, state: State, control: Control, parameters: Parameters | None, stopped: list[bool]
     ) -> State:
-        """Take a time step.
+        """Make a time step.
 
         Args:
-            state: The state before it.
-            control: Of all environments. Where a motion is infeasible, pins, kinematic bodies,
-                bases and driven joints stay where they are; forces, efforts and springs act as they
-                are, without a derivative by them.
-            parameters: Of the simulation.
-            stopped: Environments in which all is held [B]; those with a new infeasible motion are
-                added.
+            state: State before the step.
+            control: Control of all environments. If a motion is infeasible, pins, kinematic bodies,
+                bases and driven joints keep their positions; forces, efforts and springs act
+                unchanged, without derivatives with respect to them.
+            parameters: Parameters of the simulation.
+            stopped: True for environments with all prescribed motion held [B]; environments with a
+                new infeasible motion are set to True.
         """
         free = [i for i, stop in enumerate(stopped) if not stop]
         moved = None
@@ -110,14 +111,14 @@ def _held(control: Control) -> Control:
 
 
 def _each(value: Any, change: Any) -> Any:
-    """A field with its tensor changed, or each of its tensors by name."""
+    """A field with `change` applied to its tensor, or to each of its tensors by name."""
     if isinstance(value, Mapping):
         return {name: change(tensor) for name, tensor in value.items()}
     return None if value is None else change(value)
 
 
 def _places(rows: Sequence[int], count: int) -> Tensor:
-    """For each environment its place among some, 0 where it is not among them; [B]."""
+    """Index of each environment in `rows`, 0 if it is not in `rows`; [B]."""
     places = cpu.zeros(count, dtype=torch.int64)
     places[list(rows)] = cpu.arange(len(rows))
     return places
@@ -140,9 +141,10 @@ def _control_of(control: Control, rows: Tensor) -> Control:
 
 
 def _parameters_of(parameters: Parameters, rows: Tensor, count: int) -> Parameters:
-    """The parameters of some environments; which have a batch axis is known, as a step took them.
+    """The parameters of some environments.
 
-    The numbers of axes tell: with a batch axis of its own a tensor has one more than accepted.
+    A step has accepted the parameters, so the number of axes shows whether a tensor has a batch
+    axis: it then has one axis more than its quantity.
     """
     chosen: dict[str, Any] = {}
     for name, quantity in PARAMETERS.items():

@@ -24,8 +24,8 @@ from diffcloth_torch.sim.records.state import State
 
 __all__ = ["HEIGHT", "SIDE", "SheetTask", "arc", "at", "follow", "uniform"]
 
-SIDE = 0.3  # of the sheet [m]
-HEIGHT = 0.004  # at which it lies [m]
+SIDE = 0.3  # side of the sheet [m]
+HEIGHT = 0.004  # height of the lying sheet [m]
 _MATERIAL = Material(bending=1e-5, damping=1e-3, friction=0.5)
 
 
@@ -42,14 +42,14 @@ def at(positions: Tensor, vertices: Tensor) -> Tensor:
 class SheetTask(BuiltTask):
     """A square sheet of n x n vertices on a table, and two pickers.
 
-    The start is drawn: where the sheet lies and how it is turned, and where pickers are. Subclasses
-    say how it is shaped, in `shape`, and which vertices the pickers begin at. The frame of the task
-    is the center and the yaw of the sheet that lies flat as drawn.
+    The start draws position and rotation of the sheet, and positions of the pickers. Subclasses
+    define the shape of the sheet (`shape`) and the vertices at which the pickers begin (`picked`).
+    The frame of the task is the center and the yaw of the flat sheet as drawn.
     """
 
     steps = 50
-    beside: ClassVar[float] = 0.012  # how far beside a vertex a picker begins, at most [m]
-    above: ClassVar[tuple[float, float]] = (0.01, 0.02)  # and how far above it [m]
+    beside: ClassVar[float] = 0.012  # largest initial offset of a picker beside its vertex [m]
+    above: ClassVar[tuple[float, float]] = (0.01, 0.02)  # range of its height above the vertex [m]
 
     def __init__(self, *, opens_at: float = 0.0, reach: float = 0.03, **options: Any) -> None:
         """Build the scene; see `BuiltTask` for the other options.
@@ -57,7 +57,7 @@ class SheetTask(BuiltTask):
         Args:
             opens_at: The largest grasp of an open picker: 0, or -1 for a soft grasp, whose gradient
                 is nowhere zero; see `Pickers`.
-            reach: Within which a picker closes on a vertex [m].
+            reach: Largest distance at which a picker closes on a vertex [m].
             **options: As for `BuiltTask`.
         """
         self._grasp = opens_at, reach
@@ -98,7 +98,7 @@ class SheetTask(BuiltTask):
         return (row % self.side) * self.side + column % self.side
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """How the sheet lies: turned by up to .5 rad, and moved by up to 2 cm; see `Task`."""
+        """Pose of the sheet: rotated by up to .5 rad, and moved by up to 2 cm; see `Task`."""
         return {
             "turn": uniform(generator, 1, -0.5, 0.5)[0],
             "shift": uniform(generator, 2, -0.02, 0.02),
@@ -106,33 +106,33 @@ class SheetTask(BuiltTask):
         }
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
-        """Positions [B, N, 3] of the sheet before it is turned and moved: flat on the table."""
+        """Positions [B, N, 3] of the sheet before its rotation and shift: flat on the table."""
         return self.flat(len(drawn["turn"]))
 
     def flat(self, count: int) -> Tensor:
-        """Positions [B, N, 3] of the flat sheet before it is turned and moved."""
+        """Positions [B, N, 3] of the flat sheet before its rotation and shift."""
         return (self.rest + cpu.tensor([0.0, 0.0, HEIGHT])).expand(count, -1, -1)
 
     def posed(self, points: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
-        """Points [B, n, 3] turned about the vertical and moved as the sheet is."""
+        """Points [B, n, 3], rotated about the vertical and moved with the sheet."""
         return self.turned(points, drawn) + torch.nn.functional.pad(drawn["shift"], (0, 1))[:, None]
 
     def turned(self, vectors: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
-        """Vectors [B, n, 3] turned about the vertical as the sheet is."""
+        """Vectors [B, n, 3], rotated about the vertical with the sheet."""
         x, y, z = vectors.unbind(dim=-1)
         c, s = drawn["turn"].cos()[:, None], drawn["turn"].sin()[:, None]
         return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """The sheet as drawn, and pickers near the vertices that they begin at; see `Task`."""
+        """The sheet as drawn, and pickers near the vertices at which they begin; see `Task`."""
         positions = self.posed(self.shape(drawn), drawn)
         state = self.simulator.initial_state(len(positions)).replace(positions=positions)
         return self.started(state, drawn)
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """Keep where the sheet begins and which vertices the pickers begin at; place the pickers.
+        """Add the initial positions and the picked vertices to `drawn`; place the pickers.
 
-        A subclass adds "goal" [B, g, 3] to what was drawn: points where the sheet is to be.
+        A subclass adds "goal" [B, g, 3] to `drawn`: goals of points of the sheet.
         """
         drawn["start"] = state.positions
         drawn["picked"] = self.picked(drawn)
@@ -184,7 +184,7 @@ class SheetTask(BuiltTask):
         }
 
     def moves_to(self, env: EnvState, points: Tensor, grasp: Tensor) -> Tensor:
-        """Actions [B, A] that bring pickers as far towards points [B, P, 3] as they go."""
+        """Actions [B, A] that move pickers towards points [B, P, 3], within their stride."""
         moves = vectors_in(env.drawn, points - env.tools["points"]) / self.pickers.stride
         return torch.cat([moves.clamp(-1, 1), grasp[..., None]], dim=-1).flatten(1)
 
@@ -192,12 +192,12 @@ class SheetTask(BuiltTask):
 def follow(
     env: EnvState, times: Sequence[float], points: Sequence[Tensor], grasps: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
-    """Where pickers should be after the next transition, on a path; and their grasp.
+    """Wanted positions of pickers on a path after the next transition, and their grasp.
 
     Args:
-        env: Of which the time counts.
+        env: State of the environments; only the elapsed transitions are used.
         times: Transitions after which each point of the path is reached, ascending.
-        points: [B, P, 3] each.
+        points: Points of the path, [B, P, 3] each.
         grasps: The grasp on the way to each point.
 
     Returns:
@@ -219,7 +219,7 @@ def follow(
 def arc(a: Tensor, b: Tensor, height: float, count: int) -> list[Tensor]:
     """Points on half an ellipse from a to b [B, P, 3], without a itself.
 
-    Its height above the line between them is a share of its width.
+    `height` is the height of the arc above the line from a to b, over their horizontal distance.
     """
     up = (b - a)[..., :2].square().sum(dim=-1, keepdim=True).sqrt() * cpu.tensor([0.0, 0.0, height])
     turns = [math.pi * k / count for k in range(1, count + 1)]

@@ -26,7 +26,7 @@ class ClothEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Attributes:
         vector: The same environment as a batch of one.
-        task: What is to be done.
+        task: The task.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
@@ -36,7 +36,7 @@ class ClothEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Prepare the environment; `reset` starts it.
 
         Args:
-            task: What is to be done.
+            task: The task.
             render_mode: "rgb_array" for pictures by `render`; None for none.
 
         Raises:
@@ -53,13 +53,13 @@ class ClothEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode; without a seed by the numbers that follow those drawn so far."""
+        """Begin an episode; without a seed, the generator continues."""
         observation, info = self.vector.reset(seed=seed, options=options)
         super().reset(seed=seed)
         return observation[0].numpy(), _first(info)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Take a transition: the observation, the reward, whether the episode ends, information."""
+        """Return the observation, the reward, whether the episode ends, and information."""
         with torch.no_grad():
             given = float_tensor("step: `action`", action)
             check_shape("step: `action`", given.shape, [(self.task.action_size,)])

@@ -20,21 +20,21 @@ __all__ = ["FlingCloth", "SpreadCloth", "covered_area"]
 
 _PLEATS = 1.5
 _SETTLING = 15  # time steps before an episode begins
-_CELL = 0.02  # of the grid on which areas are counted [m]
-_EXTENT = 0.6  # of the grid: it reaches so far from the origin, along both axes [m]
-_WIDTH = 0.6  # of the kernel around a vertex, in distances of vertices or of cells
-_FILL = 0.54  # so that cells within a flat sheet count .97
-_BARE = 0.06  # share of the area of a flat sheet that may be missing
+_CELL = 0.02  # cell size of the grid for areas [m]
+_EXTENT = 0.6  # extent of the grid from the origin in each direction [m]
+_WIDTH = 0.6  # kernel width around a vertex, over the distance of vertices or cells, if larger
+_FILL = 0.54  # chosen such that cells within a flat sheet count .97
+_BARE = 0.06  # largest missing share of the area of a flat sheet for success
 
 
 def covered_area(positions: Tensor, spacing: float) -> Tensor:
-    """Area that vertices cover as seen from above, smooth in their positions [m^2].
+    """Area covered by vertices as seen from above, smooth in their positions [m^2].
 
     Each cell of a grid counts 1 - exp(-c sum_i k(distance to vertex i)), with a Gaussian k.
 
     Args:
-        positions: Of the vertices [B, N, 3].
-        spacing: Their distances in the flat sheet [m].
+        positions: Positions of the vertices [m], shape [B, N, 3].
+        spacing: Distance of neighbors in the flat sheet [m].
     """
     centers = cpu.arange(-_EXTENT, _EXTENT, _CELL, dtype=torch.float64)
     width = _WIDTH * max(spacing, _CELL)
@@ -42,7 +42,7 @@ def covered_area(positions: Tensor, spacing: float) -> Tensor:
         torch.exp(-0.5 * ((centers[:, None] - positions[:, None, :, axis]) / width) ** 2)
         for axis in (0, 1)
     )
-    # Sums, no matrix product: that would round by the size of the batch.
+    # Sums instead of a matrix product, whose rounding would depend on the size of the batch.
     near = torch.stack([(row[:, None] * y).sum(dim=-1) for row in x.unbind(dim=1)], dim=1)
     fill = _FILL * (spacing / width) ** 2
     return _CELL**2 * (1 - torch.exp(-fill * near)).sum(dim=(-1, -2))
@@ -51,9 +51,9 @@ def covered_area(positions: Tensor, spacing: float) -> Tensor:
 class SpreadCloth(SheetTask):
     """A sheet that lies in pleats is to be spread flat.
 
-    The start draws the pleats, and pickers begin up to 4 cm beside the edges along them. With the
-    covered area A and that of the flat sheet, Amax, the reward is graded(1 - A / Amax, .06, .5);
-    after ClothFlatten of SoftGym and unfold of DaXBench.
+    The start draws the pleats, and pickers begin up to 4 cm beside the edges along the pleats. With
+    the covered area A and the area Amax of the flat sheet, the reward is
+    graded(1 - A / Amax, .06, .5); after ClothFlatten of SoftGym and unfold of DaXBench.
     """
 
     name = "SpreadCloth"
@@ -68,7 +68,7 @@ class SpreadCloth(SheetTask):
         return SIDE / (self.side - 1)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also how steep the pleats are, and where they begin."""
+        """Also the steepness of the pleats, and their phase."""
         pleats = {
             "steepness": uniform(generator, 1, *self.steepness)[0],
             "phase": uniform(generator, 1, 0.0, 2 * math.pi)[0],
@@ -76,7 +76,7 @@ class SpreadCloth(SheetTask):
         return super().draw(generator) | pleats
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
-        """Pleats across x that keep all lengths: the slope is a sine of the arc length."""
+        """Pleats across x with unchanged lengths: the slope is a sine of the arc length."""
         n = self.side
         s = cpu.linspace(0.0, 1.0, 16 * (n - 1) + 1)
         middle = 0.5 * (s[1:] + s[:-1])
@@ -92,7 +92,7 @@ class SpreadCloth(SheetTask):
         return torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """The sheet after it has come to lie; also the area of the flat sheet, and its corners."""
+        """The settled sheet; also the area of the flat sheet, and its corners."""
         parameters = self._randomization.parameters(drawn)
         for _ in range(_SETTLING):
             state = self.simulator.step(state, None, parameters)
@@ -118,7 +118,7 @@ class SpreadCloth(SheetTask):
         return graded(self.bare(env), _BARE, 0.5)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether 94 % of the flat sheet's area are covered."""
+        """Return whether 94 % of the flat sheet's area are covered."""
         return self.bare(env) < _BARE
 
     def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
@@ -132,7 +132,7 @@ class SpreadCloth(SheetTask):
         return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=-1)[:, None]
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close on the edges, pull them apart, let go."""
+        """Close on the edges, pull them apart, release."""
         here = at(env.drawn["start"], env.drawn["picked"])
         along = self.along(env) * cpu.tensor([[-0.5], [0.5]])
         apart = here.mean(dim=1, keepdim=True) + SIDE * along
@@ -152,10 +152,10 @@ class SpreadCloth(SheetTask):
 class FlingCloth(SpreadCloth):
     """Two pickers lift a pleated sheet by one edge and spread it, by a fling or by laying it down.
 
-    The start draws the pleats and which of two opposite edges the pickers begin at. With the share
-    of the area that is covered, as in `SpreadCloth`, and the mean height h of the sheet above the
-    table, the reward is graded(1 - A / Amax + h / side, .08, .5): the sheet must lie there. After
-    the fling of RGBench.
+    The start draws the pleats, and one of two opposite edges for the pickers. With the covered
+    share A / Amax of the area, as in `SpreadCloth`, and the mean height h of the sheet above the
+    table, the reward is graded(1 - A / Amax + h / side, .08, .5): the sheet must lie on the table.
+    After the fling of RGBench.
     """
 
     name = "FlingCloth"
@@ -164,7 +164,7 @@ class FlingCloth(SpreadCloth):
     _ALLOWED = 0.08
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also the edge that the pickers begin at."""
+        """Also the edge at which the pickers begin."""
         return super().draw(generator) | {"edge": cpu.randint(2, (1,), generator=generator)[0]}
 
     def amiss(self, env: EnvState) -> Tensor:
@@ -177,7 +177,7 @@ class FlingCloth(SpreadCloth):
         return graded(self.amiss(env), self._ALLOWED, 0.5)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether at most .08 of the area, or of the side in mean height, is missing."""
+        """Return whether the missing share of area plus the mean height in sides is below .08."""
         return self.amiss(env) < self._ALLOWED
 
     def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
@@ -188,13 +188,13 @@ class FlingCloth(SpreadCloth):
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, lift the sheet, lay it down along a line, and pull it."""
         here = at(env.drawn["start"], env.drawn["picked"])
-        sign = (1 - 2 * env.drawn["edge"])[:, None, None]  # towards the edge that is held
+        sign = (1 - 2 * env.drawn["edge"])[:, None, None]  # towards the held edge
         along = sign * SIDE * self.along(env)
         foot = torch.cat([here[..., :2], torch.zeros_like(here[..., 2:])], dim=-1) - 0.9 * along
         up = cpu.tensor([0.0, 0.0, SIDE])
-        # What has been laid down and what still hangs are together as long as the sheet.
+        # The parts that lie and that hang are together as long as the sheet.
         laid = [foot + k / 6 * along + (1.02 - k / 6) * up for k in range(7)]
-        # An edge that has turned under is pulled out by friction with the table.
+        # Friction with the table pulls out an edge that is turned under.
         end = laid[-1] + 0.3 * along
         points = [here, here, *[foot + 1.15 * up] * 2, *laid, end, end, end + 0.1 * up]
         times = [4, 6, 24, 30, *(33 + 4 * k for k in range(7)), 63, 65, 68]

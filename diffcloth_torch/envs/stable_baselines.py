@@ -1,4 +1,4 @@
-"""The same environments for Stable-Baselines3: NumPy arrays, without gradients."""
+"""Environments for Stable-Baselines3: NumPy arrays, without gradients."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ __all__ = ["StableBaselinesEnv"]
 
 
 class StableBaselinesEnv(VecEnv):
-    """A `VecEnv` of Stable-Baselines3: NumPy arrays, and a new start in the step that ends.
+    """A `VecEnv` of Stable-Baselines3: NumPy arrays, and new starts in the step of an end.
 
     >>> model = stable_baselines3.PPO("MlpPolicy", StableBaselinesEnv(dc.envs.make("FoldCloth", 8)))
     """
 
     def __init__(self, env: ClothVectorEnv) -> None:
-        """Take environments that begin anew in the step in which they end."""
+        """Wrap environments that restart in the step in which they end."""
         self.env = begins_anew("StableBaselinesEnv: `env`", env)
         self._actions: NDArray[np.float32] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> NDArray[np.float32]:
-        """Observations [B, O] of new starts, by the seeds of `seed`."""
+        """Return observations [B, O] of new starts, with the seeds set by `seed`."""
         seeds = [s for s in self._seeds if s is not None]
         observation, _ = self.env.reset(seed=seeds if len(seeds) == self.num_envs else None)
         self._reset_seeds()
@@ -38,7 +38,7 @@ class StableBaselinesEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Observations, rewards, whether episodes have ended, and information for each."""
+        """Return observations, rewards, whether episodes have ended, and information for each."""
         with torch.no_grad():
             observation, reward, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
@@ -76,5 +76,5 @@ class StableBaselinesEnv(VecEnv):
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """None is wrapped."""
+        """Return False for all environments: no environment is wrapped."""
         return [False] * len(list(self._get_indices(indices)))

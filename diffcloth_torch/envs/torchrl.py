@@ -1,4 +1,4 @@
-"""The same environments for TorchRL, with gradients."""
+"""Environments for TorchRL, with gradients."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from diffcloth_torch.errors import InvalidInput
 __all__ = ["TorchRLEnv"]
 
 
-class TorchRLEnv(EnvBase):  # type: ignore[misc]  # which has no types
+class TorchRLEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
     """An `EnvBase` with the batch size [B]; rewards keep the graph of the actions.
 
     >>> env = TorchRLEnv(dc.envs.make("FoldCloth", 8, autoreset_mode="Disabled"))
@@ -25,10 +25,10 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]  # which has no types
     """
 
     def __init__(self, env: ClothVectorEnv) -> None:
-        """Take environments that do not begin anew by themselves.
+        """Wrap environments that do not restart by themselves.
 
         Raises:
-            InvalidInput: If they do.
+            InvalidInput: If the environments restart by themselves.
         """
         if env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED:
             raise InvalidInput("TorchRLEnv: `env` must have autoreset_mode='Disabled'")

@@ -1,4 +1,4 @@
-"""One strip of cloth pulls another, into which it is hooked, to a target."""
+"""Two hooked strips of cloth pull at each other; one is to reach a target."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from diffcloth_torch.tasks.scenes import scene_of
 
 __all__ = ["TwoCloths"]
 
-_PULL, _LARGEST = 0.3, 0.8  # on the ends of the other strip, and at an action of 1 [N]
+_PULL, _LARGEST = 0.3, 0.8  # force on the ends of the other strip, and at an action of 1 [N]
 _FAR = 1.0  # distance at which an episode ends [m]
-_CLOSE = 0.02  # distance to the target that succeeds, a twentieth of a strip [m]
+_CLOSE = 0.02  # largest distance to the target for success, a twentieth of a strip [m]
 
 
 class TwoCloths(BuiltTask):
     """Forces on the ends of a bent strip of cloth bring its center to a target.
 
-    Another strip, which is pulled the other way with a constant force, is hooked into it. `size` n
-    makes strips of 5 vertices across and 2 n + 7 along. The start draws the target, within 3 cm.
-    With the distance d of the center from it the reward is graded(d, 2 cm, 20 cm); the task of the
-    paper, section V.D.4. An episode ends where d is more than 1 m, and costs the least reward for
-    each transition that is left. The frame is the world.
+    Another strip, which a constant force pulls in the opposite direction, is hooked into the first.
+    `size` n makes strips of 5 vertices across and 2 n + 7 along. The start draws the target, within
+    3 cm. With the distance d of the center from the target, the reward is graded(d, 2 cm, 20 cm);
+    the task of the paper, section V.D.4. An episode ends if d is more than 1 m; then the smallest
+    reward is charged for its transition and each remaining transition. The frame is the world.
     """
 
     name = "TwoCloths"
@@ -65,7 +65,7 @@ class TwoCloths(BuiltTask):
         return self.simulator.initial_state(len(drawn["target"])), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of both strips, and what the center still has to go."""
+        """Some vertices of both strips, and the remaining way of the center."""
         state = env.state
         return {
             "positions": state.positions[:, self._rows].flatten(1),
@@ -87,15 +87,15 @@ class TwoCloths(BuiltTask):
         return torch.where(distance > _FAR, (self.worst * (1 + left)).to(reward), reward)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the center is within 2 cm of the target."""
+        """Return whether the center is within 2 cm of the target."""
         return self.distance(env) < _CLOSE
 
     def terminal(self, env: EnvState) -> Tensor:
-        """Also where the center is more than 1 m from the target."""
+        """Also true if the center is more than 1 m from the target."""
         return super().terminal(env) | (self.distance(env) > _FAR)
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Bear the pull, and be a damped spring to the target."""
+        """Balance the pull, and act as a damped spring to the target."""
         velocity = env.state.velocities[:, : self._count].mean(dim=1)
         bear = cpu.tensor([-_PULL, 0.0, 0.0])
         force = bear + 0.7 * self._away(env) - 0.12 * velocity

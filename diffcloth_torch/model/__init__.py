@@ -1,1 +1,1 @@
-"""What is simulated: cloths, bodies and the scene of them, and the options of a simulator."""
+"""The simulated objects: cloths, bodies, robots, scenes, and the options of a simulator."""

@@ -40,28 +40,28 @@ class Assembly:
             if no cloth is woven.
         cloth_vertex_start: First vertex of each cloth, then N; shape [C + 1].
         cloth_face_start: First face of each cloth, then F; shape [C + 1].
-        deforming_count: Number of cloths, the last ones, that are deforming bodies.
-        pins: Pinned vertices, without those of deforming bodies; shape [P].
+        deforming_count: Number of deforming bodies, which are the last cloths.
+        pins: Pinned vertices, without the vertices of deforming bodies; shape [P].
         soft_pins: Softly pinned vertices, shape [Q].
         pin_groups: "cloth/pin" -> rows of `pins`.
         soft_pin_groups: "cloth/pin" -> rows of `soft_pins`.
-        springs: Of attachments.
-        body_vertices: Of the K bodies in their frames, then of the Lc links that have collision
-            shapes in theirs [m], shape [V, 3].
+        springs: Springs of the attachments.
+        body_vertices: Vertices of the K bodies, then of the Lc links that have collision shapes,
+            each in the frame of its body or link [m], shape [V, 3].
         body_faces: Indices into `body_vertices`, shape [G, 3].
-        body_radii: Radius of each of these surfaces, of which `body_vertices` and `body_faces` then
-            have the skeleton; 0 of a mesh [m], shape [K + Lc].
+        body_radii: Radius of each of these surfaces [m], shape [K + Lc]. 0 for a mesh; otherwise
+            `body_vertices` and `body_faces` hold the skeleton of the surface.
         body_vertex_start: First vertex of each of these surfaces, then V; shape [K + Lc + 1].
         body_face_start: First face of each of these surfaces, then G; shape [K + Lc + 1].
         body_poses: Initial poses of the bodies, shape [K, 7].
         static_bodies: Indices of the static bodies.
         mechanisms: Mechanisms of the bodies, then of the robots; length T.
         surface_mechanism: Mechanism of each surface after the cloths, shape [K + Lc].
-        surface_link: Index of each of these surfaces' link in its mechanism, shape [K + Lc].
+        surface_link: Index in its mechanism of the link of each of these surfaces, shape [K + Lc].
         surface_names: Names of the cloths and bodies, then "robot/link"; length S.
         ignored_pairs: Pairs of surfaces a < b that are not tested for contact; shape [m, 2].
-        primitives: Primitive of each surface after the cloths that cloths touch at their vertices,
-            None for other surfaces; length K + Lc.
+        primitives: Primitive of each surface after the cloths; None for a surface that does not
+            touch cloths at their vertices; length K + Lc.
         base_poses: Initial poses of the root links of robots, shape [R, 7].
         joint_slices: Name of a robot -> its rows among the J joints.
         link_slices: Name of a robot -> its rows among the L links.
@@ -145,7 +145,7 @@ class Assembly:
 
     @property
     def forced(self) -> NDArray[np.bool_]:
-        """Which joints are moved by forces, shape [J]; see `Mechanism.forced`."""
+        """True for joints that forces move, shape [J]; see `Mechanism.forced`."""
         return np.concatenate([np.empty(0, dtype=bool), *(m.forced for m in self.mechanisms)])
 
     @property
@@ -254,7 +254,7 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
 
 
 def _material_axes(scene: Scene) -> FloatArray:
-    """Axes of all cloths where one is woven: parameters may make others differ by direction."""
+    """Axes of all cloths if one is woven, as parameters may make the others orthotropic, too."""
     if not any(cloth.material.is_orthotropic for cloth in scene.cloths):
         return np.empty((0, 2))
     cloths = zip(scene.cloth_names, scene.cloths, strict=True)
@@ -289,8 +289,9 @@ def _body_mechanism(name: str, body: RigidBody) -> Mechanism:
 def _ignored_pairs(scene: Scene) -> IndexArray:
     """Pairs of links of one robot that touch by construction, and pairs that the scene names.
 
-    And those of deforming bodies and what is prescribed, itself included: nothing gives way. The
-    pairs that overlap are added where positions are known, in `sim/overlaps.py`.
+    Pairs of a deforming body and a surface with prescribed motion, itself included, are ignored
+    too, as neither surface could yield. `sim/overlaps.py` adds the pairs that overlap, because
+    that depends on positions.
     """
     index = {name: i for i, name in enumerate(scene.surface_names)}
     named = [] if isinstance(scene.ignore_contact, str) else list(scene.ignore_contact)
@@ -310,7 +311,7 @@ def _ignored_pairs(scene: Scene) -> IndexArray:
 
 
 def _prescribed_surfaces(scene: Scene) -> list[str]:
-    """Bodies that forces do not move, and links of such robots."""
+    """Names of bodies and of robots' links that forces do not move."""
     bodies = zip(scene.body_names, scene.bodies, strict=True)
     names = [name for name, body in bodies if body.motion != "dynamic"]
     for name, robot in zip(scene.robot_names, scene.robots, strict=True):

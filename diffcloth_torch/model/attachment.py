@@ -29,17 +29,18 @@ __all__ = ["Attachment", "Points"]
 
 _DETACHED = "pass a detached tensor"
 _STIFFNESS = "differentiate with respect to Parameters.attachment_stiffness"
-_SUM = 1e-6  # how far the weights of corners may be from adding to one
+_SUM = 1e-6  # tolerance of the sum of the weights of corners, which is 1
 
 
 @saved
 class Points(NamedTuple):
-    """Points of one surface, as they were given; the scene knows what kind of surface it is.
+    """Points of one surface, as passed by the caller; the scene knows the kind of the surface.
 
     Attributes:
         surface: Name of a cloth or body, or "robot/link".
         where: Vertices of a cloth, or points in the frame of a body or link [m].
-        weights: Of these vertices; None where each is a point by itself, and for bodies and links.
+        weights: Weights of the vertices [-]; None if each vertex is a point by itself, and for
+            points of bodies and links.
     """
 
     surface: str
@@ -53,8 +54,8 @@ class Attachment:
 
     A spring of length l has the energy w k / 2 (l - L)^2 with the stiffness k, the rest length L
     and a weight w between 0 (released) and 1, which a control sets. Attachments sew cloths, hold
-    them at bodies and links and, where the second end is a target that a control moves, are pickers
-    or suction cups. Both ends feel the force.
+    them at bodies and links and, if the second end is a target that a control moves, model pickers
+    or suction cups. The force acts on both ends.
 
     >>> dc.Attachment(("left", [0, 1, 2]), ("right", [9, 10, 11]), stiffness=500.0, name="seam")
     >>> dc.Attachment(("shirt", [3, 8, 9], [0.2, 0.3, 0.5]), ("hand/palm", [0, 0, 0.02]),
@@ -91,10 +92,11 @@ class Attachment:
         - `(cloth, vertex)` or `(cloth, [vertex, ..])`: vertices, one a spring;
         - `(cloth, corners, weights)`: sums of vertices, corners and weights [m] or [n, m] with
           weights between 0 and 1 that add to one;
-        - `(body, point)` or `("robot/link", point)`: points in its frame [m], [3] or [n, 3];
-        - None, for the second end alone: targets in space, which controls set.
+        - `(body, point)` or `("robot/link", point)`: points in the frame of the body or link [m],
+          [3] or [n, 3];
+        - None, for the second end only: targets in space, which controls set.
 
-        An end of one point meets every point of the other.
+        An end of one point is connected to every point of the other end.
 
         Args:
             a: First end.
@@ -130,7 +132,7 @@ def _values(field: str, value: object, accepted: Range, instead: str) -> FloatAr
 
 
 def _points(end: str, given: Any) -> Points:
-    """Check what an end is given as, as far as that needs no scene."""
+    """Check the description of an end, as far as possible without a scene."""
     label = f"Attachment: `{end}`"
     forms = "(surface, points) or (cloth, corners, weights)"
     if not isinstance(given, tuple | list):
@@ -151,7 +153,7 @@ def _points(end: str, given: Any) -> Points:
 
 
 def _corner_weights(label: str, given: object, shape: tuple[int, ...]) -> FloatArray:
-    """Weights of corners, which add to one to the last bit that float64 has."""
+    """Weights of corners, normalized in float64 such that their sum is 1."""
     label = f"{label}, weights of corners,"
     weights = float_array(label, given)
     if len(shape) == 0:

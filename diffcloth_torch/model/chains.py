@@ -22,7 +22,7 @@ __all__ = ["chain_positions", "describe_chain", "link_surfaces", "make_chain"]
 _OWNER = "Robot.from_chain"
 _DETACHED = "pass a detached tensor"
 
-# Chains have single precision by default: their rotations are orthogonal only up to this error.
+# Chains have single precision by default, so rotations are orthogonal only up to this error.
 _ROTATION_TOLERANCE = 1e-5
 
 Limits = Mapping[str, Sequence[float]]
@@ -90,7 +90,7 @@ def _joint_names(mechanism: Mechanism) -> list[str]:
 
 
 def chain_positions(mechanism: Mechanism, joint_positions: Tensor) -> dict[str, Tensor]:
-    """Positions of all joints of the chain by name, from those of a robot, [.., J]."""
+    """Positions of all joints of the chain by name, from the positions [.., J] of a robot."""
     laws = zip(mechanism.multiplier.tolist(), mechanism.constant.tolist(), strict=True)
     rows = zip(_joint_names(mechanism), mechanism.dof.tolist(), laws, strict=True)
     return {name: a * joint_positions[..., j] + b for name, j, (a, b) in rows if j >= 0}
@@ -100,7 +100,7 @@ def chain_positions(mechanism: Mechanism, joint_positions: Tensor) -> dict[str, 
 
 
 def describe_chain(chain: Any, inertials: Inertials, limits: Limits) -> RobotDescription:
-    """Describe a chain as `read_urdf` describes a file, given the inertias and limits it lacks.
+    """Describe a chain as `read_urdf` describes a file, with the inertias and limits that it lacks.
 
     Raises:
         InvalidInput: If an argument is not accepted, or the chain does not consist of rigid links.
@@ -193,7 +193,7 @@ def _joint(frame: Any, parent: Any, limits: Limits) -> Joint:
 
 
 def _largest(label: str, field: str, joint: Any) -> float:
-    """The largest effort or speed of a chain's joint; it has -limit and limit, or none."""
+    """The largest effort or speed of a chain's joint, which stores (-limit, limit) or None."""
     given = getattr(joint, field)
     if given is None:
         return math.inf
@@ -204,7 +204,7 @@ def _largest(label: str, field: str, joint: Any) -> float:
             f"{label}: `{field}` must be (-limit, limit) with a limit >= 0, got ({lower:g}, "
             f"{upper:g}); change it in the chain"
         )
-    return upper or math.inf  # as in files
+    return upper or math.inf  # 0 means no limit, as in URDF files
 
 
 def _limits(label: str, joint: Any, limits: Limits) -> tuple[float, float]:

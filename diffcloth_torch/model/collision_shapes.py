@@ -1,7 +1,7 @@
 """Collision shapes of a robot's links as surfaces: boxes, round shapes, cylinders and mesh files.
 
-A sphere or a capsule may touch as what it is. A surface is either that or triangles, so a round
-shape beside others becomes a link of its own, welded to the one that has it.
+A sphere or a capsule may touch with its exact surface. A surface is either round or triangles, so
+a round shape beside other shapes of a link becomes a link of its own, welded to the first.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from diffcloth_torch.model.urdf import Joint, Link, RobotDescription, Shape
 
 __all__ = ["RoundLinks", "find_mesh", "link_surface", "with_round_links"]
 
-# An edge length that gives a shape more triangles is taken for a mistake.
+# An edge length that results in more triangles for a shape is treated as a mistake.
 _MOST_FACES = 200_000
 
-_DEFAULT_SUBDIVISIONS = 3  # of a sphere, as for `RigidBody.sphere`
+_DEFAULT_SUBDIVISIONS = 3  # for spheres, as in `RigidBody.sphere`
 
 _DETACHED = "pass a detached tensor"
 
@@ -41,10 +41,10 @@ class RoundLinks(NamedTuple):
     """A robot whose links are round or have triangles, not both.
 
     Attributes:
-        description: The robot, with a link more for every round shape that has been taken out of
-            one; these come last.
-        skeletons: Name of a round link -> what it touches with, in its frame.
-        parts: Name of a link -> names of the links that have been taken out of it.
+        description: The robot, with an additional link for every round shape that was split off a
+            link; the additional links are last.
+        skeletons: Name of a round link -> its contact surface, in its frame.
+        parts: Name of a link -> names of the links that were split off it.
     """
 
     description: RobotDescription
@@ -52,14 +52,14 @@ class RoundLinks(NamedTuple):
     parts: Mapping[str, tuple[str, ...]]
 
     def with_parts(self, of_links: T) -> T | dict[str, Any]:
-        """Give what a mapping says of a link to its parts, too, unless it names these."""
+        """Apply the value of a link in a mapping to its parts too, unless these have their own."""
         if not isinstance(of_links, Mapping):
             return of_links
         of_parts = {p: value for link, value in of_links.items() for p in self.parts.get(link, ())}
         return of_parts | dict(of_links)
 
     def pairs_with_parts(self, pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-        """Pairs of links, and of their parts."""
+        """Pairs of links, extended by all pairs of their parts."""
         return [
             (p, q)
             for a, b in pairs
@@ -73,7 +73,7 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
 
     Args:
         description: The robot.
-        smooth: Whether all of them are, or name of a link -> whether those of the link are.
+        smooth: True to make all of them round, or name of a link -> True to make its shapes round.
 
     Raises:
         InvalidInput: If there is no such link, or none of its shapes is a sphere or a capsule.
@@ -109,7 +109,7 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
             continue
         found = [(k, shape) for k, shape in enumerate(link.shapes) if _is_round(shape)]
         others = tuple(shape for shape in link.shapes if not _is_round(shape))
-        if not others:  # the link itself is its first one
+        if not others:  # the link itself becomes its first round shape
             skeletons[link.name] = _skeleton(found[0][1])
             others = (found.pop(0)[1],)
         links.append(replace(link, shapes=others))
@@ -180,8 +180,8 @@ def link_surface(
         link: The link.
         file: URDF file of the link.
         mesh_root: As for `find_mesh`.
-        edge_length: Longest edge of all shapes but meshes [m]; None lets the shape choose.
-        refusals: Gets the reasons against shapes, which are left out.
+        edge_length: Longest edge of all shapes but meshes [m]; None uses defaults of the shapes.
+        refusals: Collects the reasons against refused shapes, which are left out.
     """
     owner = f"{file}: <link name={link.name!r}> <collision>"
     parts = []
@@ -210,7 +210,7 @@ def _placed(
     scale = np.array(shape.size)
     if not scale.all():
         raise InvalidInput(f"{owner}: `scale` must be different from zero, got {shape.size}")
-    if scale.prod() < 0:  # a mirror image, whose faces look inward
+    if scale.prod() < 0:  # a mirror image, whose faces point inward
         faces = faces[:, ::-1]
     surface = body_arrays(owner, _in_link(shape, scale * vertices), faces, instead=_DETACHED)
     return Surface(surface.vertices, surface.faces)
@@ -221,7 +221,7 @@ def _in_link(shape: Shape, vertices: FloatArray) -> FloatArray:
 
 
 def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Mesh:
-    """Mesh of any other shape around its own origin."""
+    """Mesh of a shape other than a mesh file, around its own origin."""
     if edge_length is None:
         if shape.kind == "box":
             return shapes.box(np.array(shape.size))
@@ -240,7 +240,7 @@ def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Me
             if _longest_edge(vertices, faces) <= edge_length:
                 return vertices, faces
         raise too_many
-    # Both sides of a triangle are cut to edge_length / sqrt(2), so that its diagonal fits too.
+    # Both sides of a triangle are at most edge_length / sqrt(2), so its diagonal is short enough.
     cut = math.sqrt(2) / edge_length
     if shape.kind == "box":
         segments = np.ceil(cut * np.array(shape.size))
@@ -253,7 +253,7 @@ def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Me
         if 8 * rings * (2 * rings + rows) > _MOST_FACES:
             raise too_many
         return shapes.capsule(radius, length, int(rings), int(rows))
-    # Of 6 n segments around, each is below 2 pi r / (6 n); edges on the ends are below 1.2 r / n.
+    # Each of the 6 n segments around is below 2 pi r / (6 n); edges on the ends, below 1.2 r / n.
     rings = max(1.0, np.ceil(cut * radius * math.pi / 3))
     rows = np.ceil(cut * length)
     if 12 * rings * (rings + rows) > _MOST_FACES:
@@ -269,22 +269,23 @@ def _longest_edge(vertices: FloatArray, faces: NDArray[np.int64]) -> float:
 def find_mesh(owner: str, filename: str, file: Path, mesh_root: Path | None) -> Path:
     """Path of a mesh file that a URDF file names.
 
-    The first file of these counts. For "package://name/x" and "package:///name/x": x in a folder
-    "name" that is `mesh_root` or holds the URDF file, and name/x in `mesh_root` and in each folder
-    that holds the URDF file, the nearest one first; the package in a folder of ROS_PACKAGE_PATH, or
-    in "share" in a folder of AMENT_PREFIX_PATH; at last x in `mesh_root` and in each folder that
-    holds the URDF file. For a path: the path from the folder of the URDF file, from `mesh_root`,
-    and from each other folder that holds the URDF file.
+    Candidates are tried in this order, and the first file that exists is returned. For
+    "package://name/x" and "package:///name/x": x in a folder "name" that is `mesh_root` or holds
+    the URDF file, and name/x in `mesh_root` and in each folder that holds the URDF file, the
+    nearest one first; the package in a folder of ROS_PACKAGE_PATH, or in "share" in a folder of
+    AMENT_PREFIX_PATH; last, x in `mesh_root` and in each folder that holds the URDF file. For a
+    path: the path relative to the folder of the URDF file, to `mesh_root`, and to each other folder
+    that holds the URDF file.
 
     Args:
         owner: Opens the message.
         filename: As written in the file.
-        file: URDF file that names it.
+        file: URDF file that names the mesh file.
         mesh_root: Folder that the mesh must lie in, symbolic links resolved, if it is not in a
             folder of the environment variables; None accepts any place.
 
     Raises:
-        InvalidInput: If there is no such file, or none where it may be.
+        InvalidInput: If there is no such file, or none inside the allowed folders.
     """
     scheme, separator, rest = filename.partition("://")
     if separator and scheme != "package":

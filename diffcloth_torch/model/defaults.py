@@ -33,22 +33,23 @@ __all__ = [
 _PART_OF_EDGE = 0.1
 _PART_OF_NONADJACENT = 0.45
 _LARGEST_PART_OF_NONADJACENT = 0.5
-# Below this share of the distance that edges ask for, elements that are no neighbors touch.
+# Elements that are not neighbors touch if their distance allows less than this share of the barrier
+# distance that follows from the edges.
 _TOUCHING = 1e-6
 
 
 def _elastic(scene: Scene) -> tuple[Cloth, ...]:
-    """The cloths without deforming bodies, which are the last ones."""
+    """The cloths without the deforming bodies, which are the last entries."""
     return scene.cloths[: len(scene.cloths) - len(scene.deforming_bodies)]
 
 
 def has_contact(scene: Scene, contact: ContactOptions) -> bool:
-    """Whether any two surfaces of the scene may touch."""
+    """Return whether any two surfaces of the scene may touch."""
     return len(scene.surface_names) > 1 or (contact.self_contact and len(scene.cloths) > 0)
 
 
 def has_barrier(scene: Scene, contact: ContactOptions, scheme: str) -> bool:
-    """Whether the barrier keeps any two surfaces of the scene apart."""
+    """Return whether the barrier keeps any two surfaces of the scene apart."""
     if not ABILITIES[scheme]["barrier"]:
         return False
     nodal = sum(body.nodal_contact for body in scene.bodies)
@@ -58,12 +59,12 @@ def has_barrier(scene: Scene, contact: ContactOptions, scheme: str) -> bool:
 
 
 def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[str, Tensor]:
-    """All parameters of the scene except those of the barrier, each in its smallest shape.
+    """All parameters of the scene except the barrier's, each in its smallest shape.
 
     Args:
         scene: The scene.
-        assembly: Its arrays.
-        contact: Whether any two of its surfaces may touch.
+        assembly: Arrays of the scene.
+        contact: Whether any two surfaces of the scene may touch.
     """
     values: dict[str, FloatArray] = {}
     if scene.cloths:
@@ -123,7 +124,7 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
         values["joint_armature"] = forced * assembly.joint_armature
         for field in ("joint_effort_limits", "joint_velocity_limits"):
             limits = np.where(forced, getattr(assembly, field), np.inf)
-            values[field] = np.minimum(limits, LARGEST)  # a number, where there is none
+            values[field] = np.minimum(limits, LARGEST)  # finite even without a limit
         values["joint_friction"] = forced * assembly.joint_friction
     return values
 
@@ -131,7 +132,7 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
 def _material_values(scene: Scene, field: str) -> FloatArray:
     """One value if all cloths agree, one per cloth if each is uniform, else one per face."""
     values = [cloth.material.per_face(field) for cloth in _elastic(scene)]
-    # A deforming body has an entry like the others, which nothing uses.
+    # A deforming body has an entry as every cloth has; its value is not used.
     values += [float(np.mean(values[0]))] * len(scene.deforming_bodies)
     numbers = [value for value in values if isinstance(value, float)]
     if len(numbers) == len(values):
@@ -179,7 +180,7 @@ def choose_barrier_distance(
 
 
 def _refuse_coincident(scene: Scene) -> None:
-    """Refuse cloths with two vertices at one place, which are no hem but two cut edges."""
+    """Refuse cloths with two vertices at one place: two cut edges instead of a seam."""
     for name, cloth in zip(scene.cloth_names, _elastic(scene), strict=False):
         _, first, inverse = np.unique(
             cloth.rest_positions, axis=0, return_index=True, return_inverse=True

@@ -1,4 +1,4 @@
-"""A body that deforms by prescription: a control prescribes the motion of its vertices."""
+"""A body whose deformation is prescribed: a control sets the motion of its vertices."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _POSITIONS = "differentiate with respect to Control.body_vertices"
 class DeformingBody(Cloth):
     """A triangle mesh whose vertices follow `Control.body_vertices`; immutable.
 
-    A character that a skeleton moves, for instance. It is a surface like a pinned cloth, without
-    mass and without elasticity: cloths collide with it and slide over its moving surface. It does
-    not collide with itself, with other deforming bodies and with bodies and robots whose motion is
-    prescribed. Its vertices come after those of the cloths in `State.positions`.
+    An example is a character that a skeleton moves. The body is a surface like a pinned cloth,
+    without mass and without elasticity: cloths collide with it and slide over its moving surface.
+    It does not collide with itself, with other deforming bodies or with bodies and robots whose
+    motion is prescribed. Its vertices follow the cloths' vertices in `State.positions`.
 
     Attributes:
         vertices: Initial positions [m], shape [n, 3].
         faces: Vertex indices, shape [f, 3].
-        material: Has the friction coefficient and the thickness of the surface.
-        name: Name in the scene; None lets the scene choose one.
+        material: Friction coefficient and thickness of the surface.
+        name: Name in the scene; None means a name chosen by the scene.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class DeformingBody(Cloth):
             friction=check_parameter("DeformingBody", "friction", friction),
             thickness=check_parameter("DeformingBody", "thickness", thickness),
         )
-        # Hinges are the elements that take the least time.
+        # Hinges are the cheapest bending elements.
         super().__init__(
             vertices, faces, material=material, pose=pose, name=name, bending_model="hinge"
         )
@@ -87,7 +87,7 @@ class DeformingBody(Cloth):
             scale: Meters per unit of the file, > 0.
             triangulate: Whether to cut polygons into triangles instead of refusing them.
             weld: Distance [m] up to which vertices are merged; None merges none.
-                `file_vertices` has the vertex that stands for each one of the file.
+                `file_vertices` has the vertex of the body for each vertex of the file.
             **keywords: As for `DeformingBody`.
         """
         mesh = load_mesh(
@@ -103,7 +103,7 @@ class DeformingBody(Cloth):
         return body
 
     def material_axes(self, owner: str) -> FloatArray:
-        """Any directions: nothing depends on them."""
+        """Arbitrary directions, which no result depends on."""
         return np.tile([1.0, 0.0], (len(self.faces), 1))
 
     def __repr__(self) -> str:

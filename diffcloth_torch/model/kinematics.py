@@ -1,4 +1,4 @@
-"""Frames and velocities of the links of a mechanism, which the core places.
+"""Frames and velocities of the links of a mechanism, computed in the core.
 
 The core returns the frames F_l of all links in the root's frame, and the twists S_l of their
 joints as matrices. A change dq of the coordinate of joint l moves link l and all links that it
@@ -6,8 +6,8 @@ carries, and the twists of their joints, by
 
     dF = dq S_l F,   dS = dq (S_l S - S S_l).
 
-This is closed in F and S. So all derivatives, of any order, are products of these matrices, for
-every kind of joint.
+The derivatives contain only F and S. Derivatives of every order are therefore products of these
+matrices, for every kind of joint.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def core_tree(mechanism: Mechanism) -> _core.Tree:
 
 
 class Links:
-    """How the links of a mechanism follow its root and its joints. Immutable.
+    """Forward kinematics of a mechanism: from its root and its joints to its links. Immutable.
 
-    Everything is differentiable any number of times.
+    All results are differentiable any number of times.
 
     Attributes:
         mechanism: The mechanism.
@@ -66,8 +66,8 @@ class Links:
         moving = np.flatnonzero(mechanism.dof >= 0)
         rates = np.zeros((mechanism.link_count, mechanism.joint_count))
         rates[moving, mechanism.dof[moving]] = 1.0
-        # A first axis for the environments: rounding in one product of all of them would depend on
-        # their number.
+        # The first axis counts environments: in one product over all environments, rounding would
+        # depend on their number.
         self._carried, self._rates = constant(carried)[None], constant(rates)[None]
 
     def frames(self, root: Tensor, joints: Tensor) -> Tensor:
@@ -75,8 +75,8 @@ class Links:
 
         Args:
             root: Frames of the root link, shape [..., 4, 4].
-            joints: Values of the joints [rad or m], shape [..., J]; the leading axes of both are
-                broadcast.
+            joints: Values of the joints [rad or m], shape [..., J]; the leading axes of both
+                arguments are broadcast.
 
         Returns:
             Frames, shape [..., L, 4, 4].
@@ -117,13 +117,13 @@ class Links:
         return torch.cat([moved, angular + turned], dim=-1)
 
     def efforts(self, root: Tensor, joints: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
-        """Efforts [N, J] that do at the joints the work of forces at the links' centers of mass.
+        """Efforts [N, J] of the joints that equal forces at the links' centers of mass in work.
 
         Args:
             root: Frames of the root link, shape [N, 4, 4].
             joints: Values of the joints [rad or m], shape [N, J].
             centers: Centers of mass in the links' frames [m], shape [N or 1, L, 3].
-            forces: [N or 1, L, 3] N.
+            forces: Forces at the centers of mass [N], shape [N or 1, L, 3].
         """
         frames, twists = self.local(joints)
         local = product(root[..., None, :3, :3].mT, forces[..., None])
@@ -137,7 +137,7 @@ class Links:
         return product(self._carried, _rows(own)).reshape(own.shape)
 
     def pull_back(self, twists: Tensor, moments: Tensor) -> Tensor:
-        """push_forward transposed: [N, J] from cotangents of the links' twists, [N, L, 4, 4]."""
+        """Transpose of `push_forward`: [N, J] from cotangents [N, L, 4, 4] of the links' twists."""
         carried = product(self._carried.mT, _rows(moments)).reshape(moments.shape)
         along = (carried * twists).sum((-2, -1))
         return product(self._rates.mT, along[..., None])[..., 0]
@@ -156,7 +156,7 @@ class _Local(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
         ctx.links, joints = inputs
-        # The outputs are computed again where they are needed: so they know their derivative.
+        # Derivatives recompute the outputs from the joints; saved outputs would be constants.
         ctx.save_for_backward(joints)
         ctx.save_for_forward(joints)
 
@@ -168,7 +168,7 @@ class _Local(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, _: Any, change: Tensor) -> Any:
-        # torch computes no tangents in here; one of a tangent needs them.
+        # torch disables tangents inside `jvp`; a tangent of a tangent needs them.
         with with_tangents():
             unpack: Any = forward_ad.unpack_dual
             F, S = ctx.links.local(unpack(*ctx.saved_tensors).primal)
@@ -182,7 +182,7 @@ class _Local(torch.autograd.Function):
         return None, ctx.links.pull_back(S, moments)
 
 
-# torch reads it in every call, and inspect computes it each time unless it is there.
+# torch reads the signature in every call; inspect would compute it anew each time.
 _Local.forward.__signature__ = signature(_Local.forward)  # type: ignore[attr-defined]
 
 
@@ -204,7 +204,7 @@ def constant(array: FloatArray) -> Tensor:
 
 
 def _rows(matrices: Tensor) -> Tensor:
-    """Rows [..., 16] of matrices [..., 4, 4]; the older vmap of torch knows no `flatten`."""
+    """Rows [..., 16] of matrices [..., 4, 4]; vmap of older torch does not support `flatten`."""
     return matrices.reshape(*matrices.shape[:-2], 16)
 
 

@@ -28,25 +28,25 @@ __all__ = ["Material"]
 class Material:
     """Properties of a cloth; numbers, or one value per face for all but friction and thickness.
 
-    A cloth is isotropic unless one of the last four is set. Woven cloth stretches and bends
-    differently along its warp (`Cloth.directions`) and its weft; what is not set is as along the
-    warp.
+    A cloth is isotropic unless one of the last four attributes is set. Woven cloth stretches and
+    bends differently along its warp (`Cloth.directions`) and its weft; attributes that are not set
+    have the value along the warp.
 
     Attributes:
-        stretch: Membrane stiffness [N/m], > 0; of woven cloth that along the warp.
-        bending: Bending stiffness [N m], >= 0; of woven cloth that along the warp.
+        stretch: Membrane stiffness [N/m], > 0; for woven cloth, along the warp.
+        bending: Bending stiffness [N m], >= 0; for woven cloth, along the warp.
         poisson: Poisson ratio of bending [-], between -1 and 0.5.
         density: Mass per rest area [kg/m^2], > 0.
         damping: Time over which strain rates are damped [s], >= 0.
         friction: Friction coefficient of the surface [-], >= 0.
         thickness: Full thickness of the surface in contact [m], >= 0.
         normal_drag: Coefficient of the pressure of air that flows across the faces [-], >= 0; about
-            1 to 2 for cloth that no air passes through.
-        tangential_drag: Coefficient of the friction of air that flows along them, of both sides
+            1 to 2 for airtight cloth.
+        tangential_drag: Coefficient of the friction of air that flows along the faces, both sides
             together [-], >= 0; a few hundredths.
         stretch_weft: Membrane stiffness along the weft [N/m], > 0.
-        stretch_shear: Membrane stiffness in shear between the two [N/m], > 0.
-        bending_weft: Bending stiffness along the weft [N m], > 0 where `bending` is.
+        stretch_shear: Membrane stiffness in shear between warp and weft [N/m], > 0.
+        bending_weft: Bending stiffness along the weft [N m], > 0 where `bending` is > 0.
         bending_twill: Bending stiffness at 45 degrees to warp and weft [N m], at least
             (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) / 4.
     """
@@ -93,11 +93,11 @@ class Material:
 
     @property
     def is_orthotropic(self) -> bool:
-        """Whether a number of woven cloth is set."""
+        """Whether any attribute of woven cloth is set."""
         return any(getattr(self, field) is not None for field in STAND_INS)
 
     def per_face(self, field: str) -> float | FloatArray:
-        """Value of a field that may differ from face to face; if not set, that of the warp."""
+        """Value of a field that may differ from face to face; by default, the warp's value."""
         value = getattr(self, field)
         result: float | FloatArray = getattr(self, STAND_INS[field]) if value is None else value
         return result

@@ -1,4 +1,4 @@
-"""A tree of rigid links: how the dynamics and the core see a robot or a single rigid body."""
+"""A tree of rigid links: a robot or a single rigid body, as the dynamics and the core use it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from diffcloth_torch.saved import saved
 __all__ = ["FORCED", "JOINT_KINDS", "Mechanism"]
 
 FORCED = ("torque", "pd")
-"""Actuations that leave a joint's motion to forces."""
+"""Actuations in which forces determine the motion of a joint."""
 
 JOINT_KINDS = tuple(_core.joint_kinds)
 """Kinds of joints, in the order of their numbers in the core: see csrc/bodies/joint_kind.cpp."""
@@ -26,26 +26,27 @@ JOINT_KINDS = tuple(_core.joint_kinds)
 class Mechanism:
     """Links and joints, in float64. A rigid body is a mechanism of one link.
 
-    The pose of a link l follows from that of its parent p and its joint's value:
+    The pose of a link l follows from the pose of its parent p and its joint's value:
 
         T_l = T_p offset_l motion(axis_l, multiplier_l q[dof_l] + constant_l),
 
-    where motion turns about the axis, shifts along it, or does both. Links are in the order of the
-    file, in which a parent may follow its children. Arrays are not marked read-only, because torch
-    takes no views of read-only arrays.
+    with a motion that rotates about the axis, translates along the axis, or does both. Links are in
+    the order of the file, in which a parent may follow its children. Arrays are not marked
+    read-only, because torch accepts no views of read-only arrays.
 
     Attributes:
         name: Name of the robot or body.
-        base: "fixed", "kinematic" (the root link moves on prescribed poses), or "floating".
+        base: "fixed", "kinematic" (the root link follows prescribed poses), or "floating".
         link_names: Names of the L links.
         parent: Index of each link's parent, -1 for the root; shape [L].
         kind: Kind of each link's joint to its parent, of `JOINT_KINDS`; "fixed" for the root;
             length L.
         offset: Frame of that joint in the parent's frame, shape [L, 4, 4].
         axis: Unit axis in the joint's frame, zero for a fixed joint; shape [L, 3].
-        dof: Index of the one of the J joints that moves each link, -1 for a fixed joint; shape [L].
+        dof: Index among the J joints of the joint that moves each link, -1 for a fixed joint; shape
+            [L].
         multiplier: Factor of that joint's value, 1 unless the link's joint mimics; shape [L].
-        constant: Offset added to it [rad or m], shape [L].
+        constant: Offset added to that product [rad or m], shape [L].
         joint_names: Names of the J joints that move and do not mimic, in the order of the file.
         lower: Lower limits of the joints [rad or m], -infinity without one; shape [J].
         upper: Upper limits, likewise.
@@ -85,7 +86,7 @@ class Mechanism:
 
     @property
     def forced(self) -> NDArray[np.bool_]:
-        """Which joints are moved by forces, shape [J]; the motion of the others is prescribed."""
+        """True for joints that forces move, shape [J]; the motion of the others is prescribed."""
         return np.array([mode in FORCED for mode in self.actuation], dtype=bool)
 
     @property
@@ -114,7 +115,7 @@ class Mechanism:
     def adjacent_links(self) -> tuple[tuple[str, str], ...]:
         """Pairs of names of links connected by fixed joints and at most one moving joint."""
         group = self.rigid_group
-        # For each group, the one that carries its first link.
+        # For each link's group, the group that carries the group's first link; -1 at the root.
         above = np.where(self.parent[group] >= 0, group[self.parent[group]], -1)
         return tuple(
             (self.link_names[a], self.link_names[b])
@@ -124,10 +125,10 @@ class Mechanism:
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """Which links a joint turns when its value changes, shape [L]."""
+        """True for links that a joint rotates when its value changes, shape [L]."""
         return np.array([_core.joint_kinds[kind][0] != 0.0 for kind in self.kind], dtype=bool)
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether the root or any joint is moved by forces."""
+        """Whether forces move the root or any joint."""
         return self.base == "floating" or bool(self.forced.any())

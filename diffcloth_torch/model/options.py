@@ -23,15 +23,15 @@ __all__ = [
 ]
 
 ABILITIES = _core.schemes
-"""What each scheme is able to; the default is first."""
+"""Capabilities of each scheme; the default is first."""
 SCHEMES = tuple(ABILITIES)
 INTEGRATORS = tuple(_core.integrators)
 METRICS = tuple(_core.metrics)
 ELASTIC_SOLVERS = tuple(_core.elastic_solvers)
 CERTIFY = ("always", "gradients")
-"""Which solves end with a factor of the exact Hessian: all, or those that are differentiated."""
+"""Solves that end with a factor of the exact Hessian: all, or only the differentiated ones."""
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
-"""How cloths and dynamic bodies act on each other: together, or in turn."""
+"""Coupling of cloths and dynamic bodies: solved together, or one after the other."""
 
 
 @saved
@@ -40,13 +40,13 @@ class ContactOptions:
     """Options of contact and friction.
 
     Attributes:
-        barrier_distance: Gap below which surfaces repel each other [m], > 0; None derives it from
-            the cloths when the simulator is made.
+        barrier_distance: Gap below which surfaces repel each other [m], > 0; None derives a
+            distance from the cloths when the simulator is made.
         barrier_stiffness: Stiffness of the barrier of all pairs of surfaces [Pa], > 0; None derives
             a value for each pair from its cloths and from its free bodies.
         friction_iterations: Solves per step, each with updated friction forces, >= 1.
-        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0; also where joints
-            with friction move what they carry, in scenes without contact too.
+        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0. For joints
+            with friction, in scenes without contact too: the velocity of the parts they move.
         self_contact: Whether a cloth collides with itself.
     """
 
@@ -79,14 +79,14 @@ class SolverOptions:
 
     Attributes:
         tolerance: Largest step with the exact Hessian that counts as converged, as a velocity
-            [m/s], > 0. For Projective Dynamics: largest change of velocity that the residual force
-            gives a vertex in a time step.
+            [m/s], > 0. For Projective Dynamics: largest change of velocity of a vertex
+            by the residual force in a time step.
         max_iterations: Largest number of Newton iterations in a step, over all its solves, >= 1.
-            Between 5 and 40 is common; single steps of a sheet that whips take some hundreds.
-            Projective Dynamics may take 50 times as many iterations, which are cheaper by about the
+            Between 5 and 40 is common; single steps of a whipping sheet need some hundreds.
+            Projective Dynamics may need 50 times as many iterations, which are cheaper by about the
             same factor.
         throw: Whether a step that fails in any environment raises `NotConverged`,
-            `InfeasibleMotion` or `TurnedTooFar`. Otherwise `report.status` says which environments
+            `InfeasibleMotion` or `TurnedTooFar`. Otherwise `report.status` shows which environments
             failed. Their state is the last feasible iterate: bodies, joints and pins are where the
             motion ended (in staggered couplings, where it began). Backward raises the error if a
             loss depends on them.
@@ -97,16 +97,16 @@ class SolverOptions:
         elastic: Method for the elastic stage of the schemes "split" and "projective": "newton", or
             "projective", the local/global iterations of Projective Dynamics. Both find the same
             positions.
-        max_seconds: Longest time of a step of one environment [s], > 0, on the clock of the wall;
-            None sets no limit. A step that takes longer ends like one whose iterations are used up,
-            after a few more factorizations. Which steps do depends on the machine and its
-            load: with a limit, the same input gives the same bits only where every step ends in
-            time. Each solve of a staggered coupling, and each step in the search for an
-            equilibrium, has that time. Backward has no limit.
-        certify: Whether each solve ends with a factor of the exact Hessian, which shows that forces
-            balance at a minimum. "always" makes it for every solve. "gradients" lets a Newton or
-            chord step below the tolerance end a solve of the scheme "coupled"; `report.certified`
-            is then False. The result is the same with and without gradients. Backward and tangents
+        max_seconds: Longest wall-clock time of a step of one environment [s], > 0; None sets no
+            limit. A step that exceeds the limit ends like a step whose iterations are used up,
+            after a few more factorizations. Which steps exceed the limit depends on the machine and
+            its load: with a limit, the same input yields the same bits only if every step ends in
+            time. The limit applies to each solve of a staggered coupling, and to each step in the
+            search for an equilibrium. Backward has no limit.
+        certify: Solves that end with a factor of the exact Hessian, which shows that forces balance
+            at a minimum. "always": every solve. "gradients": a Newton or chord step below the
+            tolerance may also end a solve of the scheme "coupled"; `report.certified` is then
+            False. The result is the same with and without gradients. Backward and tangents
             of such a step certify its end first, with further Newton steps where the end is not
             accurate enough, or raise `SimulationError`. `equilibrium` always certifies.
     """

@@ -1,4 +1,4 @@
-"""Woven cloth: which numbers stand in for others, which belong together, where the warp is."""
+"""Woven cloth: default values, parameters that belong together, and directions of the warp."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ STAND_INS: Mapping[str, str] = MappingProxyType(
         "bending_twill": "bending",
     }
 )
-"""Parameter of woven cloth -> what it is where a material does not set it."""
+"""Parameter of woven cloth -> parameter whose value is its default."""
 
 WOVEN_GROUPS = (("stretch_weft", "stretch_shear"), ("bending_weft", "bending_twill"))
-"""Parameters that a scene has together or not at all."""
+"""Groups of parameters that a scene has together or not at all."""
 
 _SMALLEST_SINE = 1e-3
 
@@ -36,14 +36,15 @@ def check_bending(
     twill: FloatArray,
     poisson: FloatArray,
 ) -> None:
-    """Refuse stiffnesses of bending whose energy is negative somewhere, or has no derivative.
+    """Refuse bending stiffnesses whose energy is negative somewhere or not differentiable.
 
     Args:
         owner: Opens the message.
         bending: Stiffness along the warp, D_w [N m].
-        weft: Along the weft, D_f.
-        twill: Along the twill, D_t.
-        poisson: Poisson ratio [-]. All have shapes that broadcast, whose last axis counts faces.
+        weft: Stiffness along the weft, D_f [N m].
+        twill: Stiffness along the twill, D_t [N m].
+        poisson: Poisson ratio [-]. All arguments have shapes that broadcast, with faces as the last
+            axis.
     """
     bending, weft, twill, poisson = np.broadcast_arrays(bending, weft, twill, poisson)
     uneven = (weft > 0.0) != (bending > 0.0)
@@ -74,7 +75,7 @@ def material_axes(
     """Unit vectors of the warp in the rest frames of faces, shape [f, 2].
 
     The rest frame of a face has its first axis along the side from its first to its second vertex,
-    and its second to the left of that, seen against the normal.
+    and its second to the left of the first, seen against the normal.
 
     Args:
         owner: Opens the message.

@@ -1,13 +1,13 @@
-"""The quantities that a step takes and returns, defined once: axes, unit, range and source.
+"""The inputs and outputs of a step, defined once: axes, unit, range and source.
 
 Checks, shapes of the core's inputs, configurations and tests read these tables. Axes are numbers,
 or letters for the sizes of a scene:
 
     N cloth vertices, F faces, C cloths, K bodies, R robots, L links of all robots, J joints that
     move and do not mimic, V vertices of bodies and links, S surfaces: cloths, bodies, links that
-    have a shape; P pinned vertices, Q softly pinned ones; A springs of attachments, U of them to
-    targets; D vertices of deforming bodies. N, F, C and S count deforming bodies as cloths, the
-    last ones.
+    have a shape; P pinned vertices, Q softly pinned vertices; A springs of attachments, U springs
+    to targets; D vertices of deforming bodies. N, F, C and S count deforming bodies as the last
+    cloths.
 
 The leading axis of environments is left out.
 """
@@ -49,7 +49,7 @@ __all__ = [
 Axes = tuple[int | str, ...]
 Shape = tuple[int, ...]
 Fields = dict[str, Tensor]
-"""Values of these by name, with a leading axis of environments."""
+"""Values of quantities by name, with a leading axis of environments."""
 
 
 class Quantity(NamedTuple):
@@ -57,16 +57,18 @@ class Quantity(NamedTuple):
 
     Attributes:
         name: Name of the field.
-        unit: Its unit.
+        unit: Unit of the field.
         axes: Accepted axes, from the fewest to the most.
-        source: What it is where it is not set: that field of a class, "hold" (what the state before
-            the step has), "zero", the "result" of a step, or "released" (targets that are not set
-            do not pull).
+        source: Default value if the field is not set: the named field of a class, "hold" (the value
+            of the state before the step), "zero", the "result" of a step, or "released" (targets
+            that are not set do not pull).
         accepted: Accepted values.
-        core: Name of the core's input that it becomes; None if it has no input of its own.
-        ignored: Whether a step ignores it.
-        stores: Whether a stored energy may depend on it: false of motion, loads and dissipation.
-        at_rest: Value in a static equilibrium, where resistance to motion vanishes; None keeps it.
+        core: Name of the core's input for this field; None if the field has no input of its own.
+        ignored: Whether a step ignores the field.
+        stores: Whether a stored energy may depend on the field: False for motion, loads and
+            dissipation.
+        at_rest: Value in a static equilibrium, where resistance to motion vanishes; None keeps the
+            value of the field.
     """
 
     name: str
@@ -81,7 +83,7 @@ class Quantity(NamedTuple):
 
     @property
     def row_shape(self) -> Shape:
-        """Shape of one row of the input that a parameter becomes; its other axes count rows."""
+        """Shape of one row of the core's input for a parameter; its other axes count rows."""
         return tuple(n for n in self.axes[-1][1:] if isinstance(n, int))
 
 

@@ -1,4 +1,4 @@
-"""Refusals of independent checks, raised as one error."""
+"""Collected errors of independent checks, raised as one error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Refusals"]
 
 
 class Refusals:
-    """Collects what checks refuse, so that one error has every reason.
+    """Collects the errors of several checks, so that one error has every reason.
 
     >>> refusals = Refusals()
     >>> for link in links:
@@ -28,18 +28,18 @@ class Refusals:
 
     @contextmanager
     def collected(self) -> Iterator[None]:
-        """Collect an `InvalidInput` of the block, which ends there."""
+        """Collect an `InvalidInput` raised in the block, and end the block there."""
         try:
             yield
         except InvalidInput as error:
             self._messages.append(str(error))
 
     def raise_any(self, opening: str) -> None:
-        """Raise what has been collected, if anything has.
+        """Raise one error with all collected reasons, if there are any.
 
         Args:
-            opening: Opens the message where there are several reasons; each is a line of its own,
-                without this opening.
+            opening: Start of the message if there are several reasons; each reason then has its own
+                line, without this start.
 
         Raises:
             InvalidInput: With every reason.

@@ -46,11 +46,11 @@ __all__ = ["MOTIONS", "Primitive", "RigidBody"]
 
 MOTIONS = ("static", "kinematic", "dynamic")
 
-# Of a closed mesh, over its extent cubed: a needle of 1 m by 1 um has 1e-12. Below this, rounding
-# decides on the volume.
+# Smallest volume of a closed mesh over its extent cubed [-]; below, rounding determines the
+# volume. A needle of 1 m by 1 um has 1e-12.
 _SMALLEST_VOLUME = 1e-14
 
-# Of a sphere that begins with 20 triangles.
+# Limit for a sphere, whose subdivision begins with the 20 triangles of an icosahedron.
 _MOST_SUBDIVISIONS = int(math.log(shapes.MOST_FACES / 20, 4))
 _MOST_RINGS = 100
 
@@ -82,9 +82,9 @@ class RigidBody:
         nodal_contact: Whether cloths touch the body at their vertices, with dry friction, instead
             of through the barrier.
         primitive: Analytic surface of the body; None for a given mesh and for a cylinder.
-        smooth: Whether the body touches with its analytic surface, a sphere or a capsule; then
-            `vertices` and `faces` only show it.
-        name: Name in the scene; None lets the scene choose one.
+        smooth: Whether contact uses the analytic surface of the body, a sphere or a capsule; then
+            `vertices` and `faces` are only for display.
+        name: Name in the scene; None means a name chosen by the scene.
     """
 
     vertices: FloatArray
@@ -126,8 +126,8 @@ class RigidBody:
         Args:
             vertices: Positions in the body frame [m], shape [v, 3].
             faces: Vertex indices of triangles, shape [g, 3]. Faces of a closed mesh must point
-                outward if it determines mass properties. Faces without area, and all but one of
-                those with the same vertices, are dropped with a warning.
+                outward if it determines mass properties. Faces without area, and all but one of the
+                faces with the same vertices, are dropped with a warning.
             motion: "static", "kinematic" or "dynamic".
             pose: Initial pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
             friction: Friction coefficient [-], >= 0.
@@ -137,12 +137,12 @@ class RigidBody:
             center: Center of mass in the body frame [m], shape [3].
             inertia: Inertia about the center, in body axes [kg m^2], shape [3, 3]; symmetric,
                 positive definite, no principal moment above the sum of the others. The default is
-                that of the uniformly filled mesh, even if `center` is given.
+                the inertia of the uniformly filled mesh, even if `center` is given.
             nodal_contact: Whether cloths touch the body at their vertices, with dry friction
                 without smoothing, instead of through the barrier. Only for bodies made by `box`,
                 `sphere`, `capsule` or `plane` that are not dynamic. Cloths may then cut through
-                the body between their vertices. The scheme "projective" treats all bodies like
-                this.
+                the body between their vertices. The scheme "projective" always treats bodies
+                this way.
             name: Name in the scene.
 
         Raises:
@@ -207,7 +207,7 @@ class RigidBody:
 
     @property
     def contact_surface(self) -> ContactSurface:
-        """What the body touches with: its mesh, or the skeleton of its analytic surface."""
+        """Surface for contact, which is the mesh, or the skeleton of the analytic surface."""
         if not self.smooth or self.primitive is None:
             return ContactSurface(self.vertices, self.faces, 0.0)
         return round_surface(self.primitive)
@@ -215,7 +215,7 @@ class RigidBody:
     def _set_mass_properties(
         self, given: Mapping[str, object], faces: IndexArray, solid: MassProperties | None = None
     ) -> None:
-        """Take what is given; the rest is that of a solid, by default of the filled mesh."""
+        """Set the given properties; the others are the solid's, by default the filled mesh's."""
         density, mass, center, inertia = (given[field] for field in _MASS_PROPERTIES)
         if self.motion != "dynamic":
             for field, value in given.items():
@@ -229,7 +229,7 @@ class RigidBody:
             raise InvalidInput(
                 f"RigidBody: a dynamic body must have `density` or `mass`, one of them, got {got}"
             )
-        # The mesh is asked only where it must be: it may be open.
+        # The mesh may be open, so the filled mesh is used only if a property is missing.
         volume, middle, moments = 1.0, np.zeros(3), np.zeros((3, 3))
         if mass is None or center is None or inertia is None:
             volume, middle, moments = self._filled_mesh(faces) if solid is None else solid
@@ -249,7 +249,7 @@ class RigidBody:
         self.inertia = frozen(check_inertia("RigidBody: `inertia`", moments))
 
     def _filled_mesh(self, faces: IndexArray) -> MassProperties:
-        """Volume, center and inertia for a density of one, of a mesh that must be closed."""
+        """Volume, center and inertia of the mesh, which must be closed, for a density of one."""
         if not is_closed(faces):
             raise InvalidInput(
                 "RigidBody: a dynamic body must have `mass`, `center` and `inertia` where its "
@@ -283,8 +283,8 @@ class RigidBody:
             path: Mesh file; its coordinates are the body frame. Files in .dae need the extra
                 `robots`; their unit applies.
             scale: Meters per unit of the file, > 0.
-            triangulate: Whether to cut polygons into triangles instead of refusing them. Files in
-                .dae are refused without it: their polygons are always cut.
+            triangulate: Whether to cut polygons into triangles instead of refusing them. Must be
+                True for files in .dae, whose polygons are always cut.
             weld: Distance [m] up to which vertices are merged; None merges none.
             **keywords: As for `RigidBody`.
         """
@@ -319,13 +319,14 @@ class RigidBody:
     def sphere(
         cls, radius: float, *, subdivisions: int = 3, smooth: bool = False, **keywords: Any
     ) -> RigidBody:
-        """Make a sphere around the origin, a subdivided icosahedron with its vertices on it.
+        """Make a sphere around the origin: a subdivided icosahedron with vertices on the sphere.
 
         Args:
             radius: Radius of the sphere [m], > 0.
-            subdivisions: Times that each triangle is split into four, 0 .. 8; 3 gives 1280 faces.
-            smooth: Whether the sphere itself touches, instead of the triangles. It then rolls as a
-                sphere, has the mass properties of one, and the triangles only show it.
+            subdivisions: Number of splits of each triangle into four, 0 .. 8; with 3, 1280 faces.
+            smooth: Whether contact uses the sphere itself instead of the triangles. The body then
+                rolls as a sphere and has the mass properties of a sphere; the triangles are only
+                for display.
             **keywords: As for `RigidBody`.
         """
         length = check_number("RigidBody.sphere: `radius`", radius, POSITIVE, instead=_POSES)
@@ -343,7 +344,7 @@ class RigidBody:
         Args:
             radius: Radius of the cylinder and the half spheres [m], > 0.
             length: Length of the cylinder alone [m], > 0; the capsule is 2 radius longer.
-            smooth: Whether the capsule itself touches, instead of triangles, as for `sphere`.
+            smooth: Whether contact uses the capsule itself instead of triangles, as for `sphere`.
             **keywords: As for `RigidBody`.
         """
         name = "RigidBody.capsule: `{}`"
@@ -356,13 +357,13 @@ class RigidBody:
     def cylinder(
         cls, radius: float, length: float, *, rings: int = 5, smooth: bool = False, **keywords: Any
     ) -> RigidBody:
-        """Make a closed cylinder along z, centered at the origin, with its vertices on it.
+        """Make a closed cylinder along z, centered at the origin, with its vertices on the surface.
 
         Args:
             radius: Radius [m], > 0.
             length: Length [m], > 0.
-            rings: Rings of triangles on each end, 1 .. 100; a sixth of the number of flat sides.
-                With 5 it rolls 2 to 7 % too slowly, with 10 less than 1 %.
+            rings: Number of rings of triangles on each end, 1 .. 100; a sixth of the number of flat
+                sides. With 5 the cylinder rolls 2 to 7 % too slowly, with 10 less than 1 %.
             smooth: Must be False: a cylinder with flat ends has no smooth surface here.
             **keywords: As for `RigidBody`.
         """
@@ -381,7 +382,7 @@ class RigidBody:
     def plane(cls, size: ArrayLike, **keywords: Any) -> RigidBody:
         """Make a rectangle of two triangles at z = 0 that faces up, centered at the origin.
 
-        In contact at nodes the plane is infinite, and everything below it is inside.
+        In contact at nodes the plane is infinite, and all points below the plane are inside.
 
         Args:
             size: Lengths along x and y [m], or one length for both.

@@ -80,23 +80,23 @@ class Robot:
     Attributes:
         mechanism: The tree of links and joints.
         surfaces: Collision surface of each of the L links in the link's frame, or None; length L.
-        skeletons: Name of a smooth link -> what it touches with in place of its surface, which only
-            shows it.
+        skeletons: Name of a smooth link -> its contact surface, in place of the surface in
+            `surfaces`, which is then only for display.
         pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz], shape [7].
         joint_positions: Initial joint positions [rad or m], shape [J].
         stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], zero for other joints;
             shape [J].
         damping: Damping of these drives [N m s/rad or N s/m], shape [J].
         viscosity: Damping of the joints themselves [N m s/rad or N s/m], shape [J].
-        effort_limits: Largest efforts of the drives of "pd" joints and of what is applied to
+        effort_limits: Largest efforts of the drives of "pd" joints and largest efforts applied to
             "torque" joints [N m or N], infinity without a limit; shape [J].
         velocity_limits: Largest speeds of these joints [rad/s or m/s], likewise.
-        joint_friction: Their Coulomb friction [N m or N], shape [J].
+        joint_friction: Coulomb friction of these joints [N m or N], shape [J].
         friction: Friction coefficient of each link's surface [-], shape [L].
         thickness: Full thickness of each link's surface [m], shape [L].
         ignore_contact: Pairs of names of links that do not collide with each other, or
             "overlapping".
-        name: Name in the scene; None lets the scene choose one.
+        name: Name in the scene; None means a name chosen by the scene.
     """
 
     mechanism: Mechanism
@@ -139,31 +139,32 @@ class Robot:
     ) -> Robot:
         """Read a URDF file.
 
-        Joints may be fixed, revolute, continuous or prismatic. The J joints are those that move and
-        do not mimic. Links and joints keep the order of the file. A mapping name -> value may omit
-        names; these have the default.
+        Joints may be fixed, revolute, continuous or prismatic. The J joints are the joints that
+        move and do not mimic. Links and joints keep the order of the file. A mapping name -> value
+        may omit names, which have the default.
 
         Args:
             path: URDF file.
             mesh_root: Folder that must contain all mesh files which are not in the packages of
-                ROS_PACKAGE_PATH and AMENT_PREFIX_PATH; "package://name/x" means name/x or x in it.
-                By default these packages and the folders that hold the URDF file are searched, and
-                meshes may lie anywhere: give it for a file that you do not trust.
+                ROS_PACKAGE_PATH and AMENT_PREFIX_PATH; "package://name/x" means name/x or x in this
+                folder. By default these packages and the folders that hold the URDF file are
+                searched, and meshes may lie anywhere: set `mesh_root` for files from untrusted
+                sources.
             base: "fixed", "kinematic" (the root link follows prescribed poses) or "floating".
             pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz]; the identity by
                 default.
             joint_positions: Initial joint positions [rad or m], within the limits; one value,
-                name -> value, or [J]. By default each is the position within its limits that is
-                nearest to zero.
+                name -> value, or [J]. By default each joint has the position within its limits
+                that is nearest to zero.
             actuation: "position" and "velocity" prescribe the motion of a joint; with "torque" and
                 "pd" the joint responds to forces. One mode, name -> mode, or J modes. By default
                 "pd", but "position" for a joint whose limits leave it one position.
             stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], >= 0; one value,
                 name -> value, or [J].
             damping: Damping of these drives [N m s/rad or N s/m], >= 0; as `stiffness`.
-            effort_limits: Largest efforts of "pd" and "torque" joints [N m or N], > 0. None takes
-                those of the file, where 0 means no limit; False applies none. Otherwise one value,
-                name -> value or False (the rest as in the file), or [J].
+            effort_limits: Largest efforts of "pd" and "torque" joints [N m or N], > 0. None means
+                the limits of the file, where 0 means no limit; False applies no limits. Otherwise
+                one value, name -> value or False (the rest as in the file), or [J].
             velocity_limits: Largest speeds of these joints [rad/s or m/s], > 0, likewise.
             joint_friction: Coulomb friction of these joints [N m or N], >= 0, likewise.
             friction: Friction coefficient of the surfaces of links [-], >= 0; one value, or link ->
@@ -171,10 +172,11 @@ class Robot:
             thickness: Full thickness of these surfaces [m], >= 0; one value, or link -> value.
             edge_length: Longest edge of the surfaces of all shapes but meshes [m], > 0. With None a
                 box has 12 triangles, a sphere 1280, a capsule 1024 and a cylinder about 400.
-            smooth: Whether spheres themselves touch, instead of their triangles; True or False for
-                all, or link -> True or False. A sphere beside other shapes of its link becomes a
-                link "link/k" of its own, the k-th shape of the link counted from 0, which is welded
-                to it, comes after those of the file and has what mappings say of the link.
+            smooth: Whether contact uses spheres and capsules themselves instead of their triangles;
+                True or False for all, or link -> True or False. A sphere or capsule beside other
+                shapes of its link becomes a link "link/k" of its own, for the k-th shape of the
+                link counted from 0. The new link is welded to the link, follows the links of the
+                file and has the link's values in mappings.
             ignore_contact: Pairs of names of links that do not collide with each other, or
                 "overlapping": the pairs that intersect, touch or are closer than their thickness in
                 the initial state of a scene. Links connected rigidly, or by a single moving joint,
@@ -242,12 +244,11 @@ class Robot:
         actuation: Actuation = None,
         **options: Any,
     ) -> Robot:
-        """Take a chain of pytorch-kinematics, and what it does not carry.
+        """Convert a chain of pytorch-kinematics, with surfaces and inertias that chains lack.
 
-        A chain has frames, joints and their limits. Of a file it drops masses, collision shapes,
-        the damping and friction of joints and which of them mimic others: where there is a file,
-        `load` keeps them. Frames become links by their names; offsets in single precision are
-        exact to 1e-7.
+        A chain has frames, joints and their limits. It does not keep masses, collision shapes,
+        damping and friction of joints, or mimic relations of a file: use `load` if there is a file.
+        Frames become links with the same names; offsets in single precision are exact to 1e-7.
 
         >>> chain = pk.build_chain_from_urdf(Path("arm.urdf").read_bytes())
         >>> hand = dc.RigidBody.box(0.1)
@@ -257,11 +258,11 @@ class Robot:
 
         Args:
             chain: `pytorch_kinematics.Chain` or `SerialChain`; not changed.
-            surfaces: Name of a frame -> vertices in it [m], shape [n, 3], and triangles, shape
-                [f, 3]; frames that are left out do not collide.
-            inertials: Name of a frame -> mass [kg], center of mass in it [m], shape [3], and
-                inertia about that center [kg m^2], shape [3, 3]; required for links that are moved
-                by forces.
+            surfaces: Name of a frame -> vertices in the frame [m], shape [n, 3], and triangles,
+                shape [f, 3]; frames that are left out do not collide.
+            inertials: Name of a frame -> mass [kg], center of mass in the frame [m], shape [3], and
+                inertia about that center [kg m^2], shape [3, 3]; required for links that forces
+                move.
             limits: Name of a joint -> lower and upper limit [rad or m], in place of the chain's.
             base: "fixed", "kinematic" or "floating", as in `load`.
             actuation: As in `load`.
@@ -270,9 +271,8 @@ class Robot:
                 `name`, as in `load`.
 
         Raises:
-            InvalidInput: If an argument is not accepted, or a link that is moved by forces has no
-                mass.
-            TypeError: If something has a wrong type.
+            InvalidInput: If an argument is not accepted, or a link that forces move has no mass.
+            TypeError: If an argument has a wrong type.
         """
         label = "Robot.from_chain"
         check_choice(f"{label}: `base`", base, BASES)
@@ -340,7 +340,7 @@ class Robot:
 
     @property
     def contact_surfaces(self) -> tuple[ContactSurface | None, ...]:
-        """What each link touches with: its mesh, or the skeleton of a smooth one; or None."""
+        """Contact surface of each link, which is its mesh, its skeleton if smooth, or None."""
         return tuple(
             None
             if mesh is None
@@ -350,27 +350,28 @@ class Robot:
 
     @property
     def chain(self) -> Any:
-        """A `pytorch_kinematics.Chain` of the links, to plan with: a new one each time.
+        """A new `pytorch_kinematics.Chain` of the links, for planning.
 
-        Its frames are in that of the root link, in float64, and agree with `forward_kinematics` to
-        rounding. Make a `SerialChain` in float64 too, and take joints by their names: chains have
-        an order of their own. Joints that mimic others are joints of their own there.
+        Its frames are relative to the root link's frame, in float64, and agree with
+        `forward_kinematics` to rounding. Make a `SerialChain` in float64 too, and address joints by
+        name: chains have their own order of joints. Joints that mimic others are separate joints of
+        the chain.
 
         >>> serial = pk.SerialChain(robot.chain, "hand", dtype=torch.float64)
         >>> jacobian = serial.jacobian(q)
         """
-        with cpu.DEVICE:  # as pytorch-kinematics takes torch's default
+        with cpu.DEVICE:  # pytorch-kinematics uses torch's default device
             return make_chain(self.mechanism)
 
     def chain_positions(self, joint_positions: Tensor) -> dict[str, Tensor]:
-        """Positions of all joints of `chain`, those that mimic included.
+        """Positions of all joints of `chain`, mimicking joints included.
 
         Args:
-            joint_positions: [rad or m], shape [.., J].
+            joint_positions: Joint positions [rad or m], shape [.., J].
 
         Returns:
-            Name of a joint of the chain -> its position, shape [..]: what
-            `chain.forward_kinematics` takes.
+            Name of a joint of the chain -> its position, shape [..]: the argument of
+            `chain.forward_kinematics`.
         """
         q = self._checked_positions("chain_positions", joint_positions)
         return chain_positions(self.mechanism, q)
@@ -433,7 +434,7 @@ def _named(
     default: float | FloatArray,
     accepted: Range = ANY_NUMBER,
 ) -> FloatArray:
-    """One value for each name, from one for all, from name -> value, or from an array of them."""
+    """One value per name, from one value for all, from name -> value, or from an array."""
     label = f"Robot: `{field}`"
     instead = f"differentiate with respect to {_DIFFERENTIABLE[field]}"
     if isinstance(given, Mapping):
@@ -452,7 +453,7 @@ def _named(
 
 
 def _bounds(field: str, given: object, names: Sequence[str], of_file: FloatArray) -> FloatArray:
-    """One value for each joint, from those of its file unless something else is given."""
+    """One value for each joint: the value of the file unless the caller sets another."""
     none, accepted = (0.0, NON_NEGATIVE) if field == "joint_friction" else (np.inf, POSITIVE)
     if given is None:
         return frozen(np.array(of_file))
@@ -481,9 +482,9 @@ def _check_known(field: str, given: Iterable[object], names: Sequence[str]) -> N
 
 
 def _modes(owner: str, given: object, names: Sequence[str]) -> list[str | None]:
-    """Actuation of each joint, from one for all, from name -> mode, or from a list of them.
+    """Actuation of each joint, from one mode for all, from name -> mode, or from a list of modes.
 
-    None lets the limits of a joint choose.
+    Without a mode (None), the limits of the joint determine the mode.
     """
     label = f"{owner}: `actuation`"
     modes: list[object]

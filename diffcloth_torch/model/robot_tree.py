@@ -28,13 +28,13 @@ def make_mechanism(
     """Make the mechanism of a robot.
 
     Args:
-        file: File of the robot, or the function that made it; opens messages.
+        file: File of the robot, or the function that made the description; starts messages.
         description: Contents of the file.
         base: "fixed", "kinematic" or "floating".
-        actuation: Actuation of the joints that move and do not mimic, in their order. None is "pd"
-            where the limits leave the joint a range, and "position" elsewhere.
-        refusals: Gets a reason where limits leave a joint no position, or where a part that is
-            moved by forces has no mass or an inertia that no body can have.
+        actuation: Actuation of the joints that move and do not mimic, in their order. None means
+            "pd" if the limits allow the joint a range, and "position" otherwise.
+        refusals: Collects a reason if limits allow a joint no position, or if a part that forces
+            move has no mass or an impossible inertia.
     """
     links, joints = description.links, description.joints
     carrier = {joint.child: joint for joint in joints}
@@ -105,7 +105,7 @@ def _limits(
     dof: Mapping[str, int],
     refusals: Refusals,
 ) -> tuple[FloatArray, FloatArray]:
-    """Limits of the joints, narrowed by those of the joints that mimic them."""
+    """Limits of the joints, narrowed by the limits of the joints that mimic them."""
     lower, upper = np.full(len(dof), -np.inf), np.full(len(dof), np.inf)
     for joint in joints:
         if joint.type == "fixed":
@@ -140,7 +140,7 @@ def _modes(
     actuation: Sequence[str | None],
     refusals: Refusals,
 ) -> tuple[str, ...]:
-    """Actuation of the joints, chosen where none is given."""
+    """Actuation of the joints, with defaults where the caller sets none."""
     modes = []
     for j, (name, mode) in enumerate(zip(names, actuation, strict=True)):
         has_one_position = lower[j] == upper[j]
@@ -156,10 +156,10 @@ def _modes(
 
 
 class JointBounds(NamedTuple):
-    """What the J joints of a robot can do and what resists them, those that mimic them included.
+    """Limits and friction of the J joints of a robot, including the joints that mimic them.
 
     Attributes:
-        efforts: Largest efforts of their drives [N m or N], infinity without a limit; shape [J].
+        efforts: Largest efforts of drives [N m or N], infinity without a limit; shape [J].
         velocities: Largest speeds [rad/s or m/s], likewise.
         friction: Coulomb friction [N m or N], shape [J].
     """
@@ -172,9 +172,10 @@ class JointBounds(NamedTuple):
 def joint_bounds(joints: Sequence[Joint]) -> JointBounds:
     """Bounds of the joints that move and do not mimic.
 
-    A joint that mimics moves m times as fast as the one that it follows, so by virtual work its
-    efforts count |m| times there, and its limit of speed is 1/|m| of itself. Its own drive adds to
-    that of a joint with a limit; without a limit it has no drive of its own.
+    A mimicking joint moves m times as fast as the joint that it follows. By virtual work, its
+    efforts and friction count |m| times at the followed joint, and its limit of speed counts 1/|m|
+    times. If a mimicking joint has a finite effort limit, its drive adds to the followed joint's;
+    without a limit it has no drive of its own.
     """
     by_name = {joint.name: joint for joint in joints}
     leaders = [joint for joint in joints if joint.moves]
@@ -197,9 +198,9 @@ def joint_bounds(joints: Sequence[Joint]) -> JointBounds:
 
 
 def _check_masses(file: Path | str, mechanism: Mechanism, refusals: Refusals) -> None:
-    """Require a mass and an inertia of all that is moved by forces.
+    """Require a mass and an inertia of every body that forces move.
 
-    Links connected by fixed joints are one body, so some of them may have no mass, or be a point.
+    Links connected by fixed joints are one body, so single links may have no mass or no extent.
     """
     group = mechanism.rigid_group
     for first in mechanism.order:
@@ -224,7 +225,7 @@ def _check_masses(file: Path | str, mechanism: Mechanism, refusals: Refusals) ->
 
 
 def _common_inertia(mechanism: Mechanism, first: int, members: Sequence[int]) -> FloatArray:
-    """Inertia [3, 3] of links that fixed joints connect to the first: about their common center."""
+    """Inertia [3, 3] about their common center of links that fixed joints connect to the first."""
     frames = {first: np.eye(4)}
     for link in mechanism.order:
         if link in members and link not in frames:
@@ -241,7 +242,7 @@ def _common_inertia(mechanism: Mechanism, first: int, members: Sequence[int]) ->
 
 
 def moves_by_forces(mechanism: Mechanism, link: int) -> bool:
-    """Whether there is a floating base, or a torque or pd joint, between the world and a link."""
+    """Return whether a floating base, or a torque or pd joint, is between the world and a link."""
     while mechanism.parent[link] >= 0:
         j = mechanism.dof[link]
         if j >= 0 and mechanism.forced[j]:

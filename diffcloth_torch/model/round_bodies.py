@@ -1,7 +1,8 @@
-"""Bodies with a surface that has no facets: their skeletons, and their mass properties.
+"""Bodies with a surface without facets: their skeletons, and their mass properties.
 
-A sphere is all that is within its radius of a point, a capsule likewise of a segment. The core only
-has this skeleton: what touches the body is the radius away from it.
+A sphere is the set of points within its radius of a point, a capsule within its radius of a
+segment. The core only has this skeleton: objects that touch the body are at the radius' distance
+from the skeleton.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ class Primitive(NamedTuple):
 
     Attributes:
         kind: "plane" (z = 0, the solid below), "sphere", "capsule" (along z) or "box".
-        size: In the order of the kinds: nothing; the radius; the radius, and half the length of the
-            cylinder; half the lengths [m]. Padded with zeros.
+        size: Size [m], padded with zeros: nothing for a plane; the radius of a sphere; the radius
+            and half the length of the cylinder of a capsule; half the lengths of a box.
     """
 
     kind: str
@@ -33,13 +34,13 @@ class Primitive(NamedTuple):
 
 @saved
 class ContactSurface(NamedTuple):
-    """What a body touches with.
+    """Contact surface of a body: a mesh, or a skeleton with a radius.
 
     Attributes:
-        vertices: Of the mesh, or of a skeleton: its ends, then what says how it turns; four that do
-            not lie in one plane [m], shape [v, 3].
-        faces: Of the mesh; [[0, 0, 0]] of a point, [[0, 1, 1]] of a segment.
-        radius: Of what is round around its skeleton [m]; 0 of a mesh.
+        vertices: Vertices of the mesh, or four points of a skeleton that do not lie in one plane:
+            its ends, then points that define its orientation [m], shape [v, 3].
+        faces: Faces of the mesh; [[0, 0, 0]] for a point, [[0, 1, 1]] for a segment.
+        radius: Radius around the skeleton [m]; 0 for a mesh.
     """
 
     vertices: FloatArray
@@ -62,7 +63,7 @@ def round_solid(primitive: Primitive) -> tuple[float, FloatArray, FloatArray]:
     r, half, _ = primitive.size
     ball = 4.0 / 3.0 * math.pi * r**3
     tube = math.pi * r**2 * 2.0 * half
-    share = tube / (ball + tube)  # of the mass
+    share = tube / (ball + tube)  # of the cylinder in the mass
     along = share * r**2 / 2 + (1 - share) * 2 / 5 * r**2
     # Half a ball has its center 3/8 r from its flat side.
     across = share * (r**2 / 4 + half**2 / 3) + (1 - share) * (

@@ -41,15 +41,15 @@ class Scene:
         deforming_bodies: Bodies that deform by prescription.
         robots: Robots.
         gravity: Acceleration [m/s^2], shape [3].
-        air_density: Density of the air [kg/m^3], which cloths with drag feel.
+        air_density: Density of the air [kg/m^3], which acts on cloths with drag.
         ignore_contact: Pairs of names of surfaces that do not collide with each other, or
             "overlapping".
-        cloth_names: Names of the cloths; "cloth0", "cloth1" .. where none was given; and of the
-            deforming bodies, "deforming0" .. likewise.
-        body_names: Names of the bodies; "body0", "body1" .. where none was given.
-        robot_names: Names of the robots; "robot0", "robot1" .. where none was given.
+        cloth_names: Names of the cloths, by default "cloth0", "cloth1" ..; then of the deforming
+            bodies, by default "deforming0" .. .
+        body_names: Names of the bodies; by default "body0", "body1" .. .
+        robot_names: Names of the robots; by default "robot0", "robot1" .. .
         attachments: Springs between points of the scene, or to targets.
-        attachment_names: Their names; "attachment0", "attachment1" .. where none was given.
+        attachment_names: Names of the attachments; by default "attachment0", "attachment1" .. .
         springs: The springs of all attachments, as arrays.
     """
 
@@ -82,21 +82,24 @@ class Scene:
 
         Args:
             cloths: At least one cloth; may be empty if a body or a robot is dynamic.
-            bodies: Bodies, rigid ones in the order of `body_poses`, deforming ones in that of
-                `Control.body_vertices`.
+            bodies: Bodies: rigid bodies in the order of `body_poses`, deforming bodies in the order
+                of `Control.body_vertices`.
             robots: Robots, in the order of `base_poses`; their joints are numbered in the same
                 order.
             gravity: Acceleration [m/s^2], shape [3].
-            air_density: Density of the air [kg/m^3], >= 0; by default that at 20 degrees Celsius.
+            air_density: Density of the air [kg/m^3], >= 0; by default the density at 20 degrees
+                Celsius.
             ignore_contact: Pairs of names of surfaces that do not collide with each other, or
                 "overlapping": the pairs of bodies and links that intersect, touch or are closer
                 than their thickness in the initial state.
             attachments: Springs between points of the scene, or to targets.
 
         Raises:
-            InvalidInput: If nothing in the scene moves by forces, a name occurs twice, a pair
-                names what is no surface, or an attachment names what the scene does not have.
-            TypeError: If something is not a Cloth, a RigidBody, a Robot or an Attachment.
+            InvalidInput: If forces move nothing in the scene, a name occurs twice, a name in a pair
+                belongs to no surface, or an attachment refers to a surface or vertex that the scene
+                does not have.
+            TypeError: If an item is not a Cloth, a RigidBody, a DeformingBody, a Robot or an
+                Attachment.
         """
         sheets = _instances("cloths", cloths, Cloth)
         for i, sheet in enumerate(sheets):
@@ -144,7 +147,7 @@ class Scene:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether any body or robot is dynamic, that is moved by forces."""
+        """Whether any body or robot is dynamic, i.e., moved by forces."""
         bodies = any(body.motion == "dynamic" for body in self.bodies)
         return bodies or any(robot.mechanism.is_dynamic for robot in self.robots)
 
@@ -162,7 +165,7 @@ class Scene:
     def _attached(self) -> dict[str, AttachedSurface]:
         shaped = [s for robot in self.robots for s in robot.contact_surfaces if s is not None]
         vertices = [cloth.vertices for cloth in self.cloths]
-        # Of a smooth one, the points that say where it is in the core.
+        # Smooth bodies and links are attached at the points of their skeletons, which the core has.
         vertices += [body.contact_surface.vertices for body in self.bodies]
         vertices += [s.vertices for s in shaped]
         return surfaces_of(self.surface_names, vertices, len(self.cloths))

@@ -1,4 +1,4 @@
-"""The springs of a scene's attachments, as arrays: what the core takes."""
+"""The springs of a scene's attachments, as arrays for the core."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from diffcloth_torch.saved import saved
 
 __all__ = ["AttachedSurface", "Springs", "make_springs", "surfaces_of"]
 
-# Of a body, over its extent cubed: below this its vertices lie in one plane.
+# Volume of four vertices of a body over its extent cubed, below which the body is flat [-].
 _FLAT = 1e-9
-# How far a point may be off the plane of a flat body, over its extent.
+# Largest distance of a point from the plane of a flat body, over the body's extent [-].
 _OFF_PLANE = 1e-9
 
 
@@ -25,9 +25,10 @@ class AttachedSurface(NamedTuple):
     """A surface that points can be on.
 
     Attributes:
-        first: Its first vertex among those of all surfaces.
-        vertices: Of a body or link, in its frame [m]; of a cloth, its initial ones, shape [v, 3].
-        is_cloth: Whether it is a cloth.
+        first: Index of its first vertex among the vertices of all surfaces.
+        vertices: Vertices of a body or link in its frame, or initial vertices of a cloth [m], shape
+            [v, 3].
+        is_cloth: Whether the surface is a cloth.
     """
 
     first: int
@@ -45,15 +46,15 @@ class Springs:
     """All A springs of a scene, attachment after attachment, U of them to targets.
 
     Attributes:
-        start: First entry of the points of each spring, and their number; shape [A + 1].
-        points: Vertices of cloths, then of bodies and links.
-        coefficients: Of the points; those of the second end are negative.
-        rest_lengths: [m], shape [A].
-        targets: Row of the target of each spring, -1 where it has none; shape [A].
-        stiffness: [N/m], shape [A].
+        start: First entry of each spring in `points`, then the number of entries; shape [A + 1].
+        points: Indices of vertices, which count cloths, then bodies and links.
+        coefficients: Coefficients of the points [-]; negative for the second end.
+        rest_lengths: Rest lengths [m], shape [A].
+        targets: Row of the target of each spring, -1 without a target; shape [A].
+        stiffness: Stiffness [N/m], shape [A].
         groups: Name of an attachment -> its rows among the A springs.
         target_groups: Name of an attachment to targets -> its rows among the U targets.
-        surfaces: Names of the bodies and links that something is attached to.
+        surfaces: Names of the bodies and links with attachments.
     """
 
     start: IndexArray = field(default_factory=lambda: np.zeros(1, dtype=np.int32))
@@ -76,7 +77,7 @@ class Springs:
 
 
 class _Sum(NamedTuple):
-    """A point as a sum over vertices."""
+    """A point as a weighted sum over vertices."""
 
     vertices: IndexArray
     coefficients: FloatArray
@@ -90,8 +91,8 @@ def make_springs(
     """Resolve the points of attachments.
 
     Args:
-        names: Of the attachments.
-        attachments: What is attached to what.
+        names: Names of the attachments.
+        attachments: The attachments.
         surfaces: Name -> surface.
 
     Raises:
@@ -135,7 +136,7 @@ def make_springs(
 def _springs_of(
     label: str, attachment: Attachment, surfaces: Mapping[str, AttachedSurface]
 ) -> list[_Sum]:
-    """Of each spring, the points of both ends."""
+    """For each spring, the points of both ends as one sum: first end minus second end."""
     a = _resolve(f"{label}: `a`", attachment.a, surfaces)
     if attachment.b is None:
         return a
@@ -165,7 +166,7 @@ def _springs_of(
 
 
 def _merged(vertices: IndexArray, coefficients: FloatArray) -> _Sum:
-    """Each vertex once, in the order of the first time."""
+    """Merge repeated vertices, in the order of first occurrence, and add their coefficients."""
     unique, first, inverse = np.unique(vertices, return_index=True, return_inverse=True)
     sums = np.zeros(len(unique))
     np.add.at(sums, inverse, coefficients)
@@ -201,7 +202,7 @@ def _cloth_points(label: str, points: Points, surface: AttachedSurface) -> list[
 
 
 def _rigid_points(label: str, where: FloatArray, surface: AttachedSurface) -> list[_Sum]:
-    """Points as affine combinations of vertices, which move as the points do."""
+    """Points of a rigid surface as affine combinations of its vertices, which move with it."""
     frame = _frame_of(surface.vertices)
     origin, edges = (
         surface.vertices[frame[0]],
@@ -223,7 +224,7 @@ def _rigid_points(label: str, where: FloatArray, surface: AttachedSurface) -> li
 
 
 def _frame_of(vertices: FloatArray) -> IndexArray:
-    """Four vertices far from one plane, or three far from one line where there is but a plane."""
+    """Four vertices far from one plane, or, if the surface is flat, three far from one line."""
     first = int(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmax())
     d = vertices - vertices[first]
     second = int(np.linalg.norm(d, axis=1).argmax())
@@ -241,7 +242,7 @@ def _frame_of(vertices: FloatArray) -> IndexArray:
 def surfaces_of(
     names: Sequence[str], vertices: Sequence[FloatArray], cloth_count: int
 ) -> dict[str, AttachedSurface]:
-    """Surfaces by name, from the vertices of each; cloths come first."""
+    """Surfaces by name, from the vertices of each surface; cloths are first."""
     starts = np.cumsum([0, *(len(v) for v in vertices)]).tolist()
     return {
         name: AttachedSurface(first, own, k < cloth_count)

@@ -1,7 +1,7 @@
 """URDF files, read safely.
 
-A file is first reduced to the elements and attributes of `urdf_document`, all checked and with
-their defaults. The description is made from these alone, and must be a tree of links.
+A file is first reduced to the elements and attributes of `urdf_document`, which are checked and
+completed by defaults. The description is made from these alone, and must be a tree of links.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from diffcloth_torch.model.urdf_document import reduced
 
 __all__ = ["Joint", "Link", "RobotDescription", "Shape", "describe_urdf", "read_urdf"]
 
-# Robots with a thousand links have files of a few MB.
+# Files of robots with a thousand links have a few MB.
 _LARGEST_FILE = 16 * 2**20  # bytes
 
 _COUNTS = {2: "two", 3: "three"}
 
-# An axis shorter than this is taken for zero.
+# A shorter axis is treated as zero.
 _SHORTEST_AXIS = 1e-9
 
 
@@ -41,9 +41,9 @@ class Shape:
 
     Attributes:
         kind: "box", "cylinder", "sphere", "capsule" or "mesh".
-        frame: Its frame in the link's frame, shape [4, 4].
-        size: Lengths of a box; radius and length of a cylinder, also of that in a capsule; radius
-            of a sphere [m]; scale of a mesh along its axes.
+        frame: Frame of the shape in the link's frame, shape [4, 4].
+        size: Lengths of a box; radius and length of a cylinder, or of the cylinder in a capsule;
+            radius of a sphere [m]; scale of a mesh along its axes [-].
         filename: File name of a mesh, as written in the file; empty for other shapes.
     """
 
@@ -58,11 +58,11 @@ class Link:
     """A link.
 
     Attributes:
-        name: Its name.
-        mass: Its mass [kg].
+        name: Name of the link.
+        mass: Mass [kg].
         center: Center of mass in the link's frame [m], shape [3].
         inertia: Inertia about the center, in the link's axes [kg m^2], shape [3, 3].
-        shapes: Its collision shapes.
+        shapes: Collision shapes of the link.
     """
 
     name: str
@@ -77,19 +77,19 @@ class Joint:
     """A joint between two links.
 
     Attributes:
-        name: Its name.
+        name: Name of the joint.
         type: "fixed", "revolute", "continuous" or "prismatic".
-        parent: Name of the link that carries it.
-        child: Name of the link that it carries.
-        frame: Its frame in the parent's frame, shape [4, 4].
+        parent: Name of the link that carries the joint.
+        child: Name of the link that the joint carries.
+        frame: Frame of the joint in the parent's frame, shape [4, 4].
         axis: Axis of unit length in the joint's frame, shape [3].
         lower: Lower limit [rad or m], -infinity without one.
         upper: Upper limit [rad or m], infinity without one.
-        viscosity: Its damping [N m s/rad or N s/m].
-        effort: Largest effort of its drive [N m or N], infinity without a limit.
+        viscosity: Damping of the joint [N m s/rad or N s/m].
+        effort: Largest effort of the joint's drive [N m or N], infinity without a limit.
         velocity: Largest speed [rad/s or m/s], infinity without a limit.
-        friction: Its Coulomb friction [N m or N].
-        mimic: Name of the joint whose value it follows, a multiplier and an offset; or None.
+        friction: Coulomb friction of the joint [N m or N].
+        mimic: Name of the followed joint, multiplier and offset of its value; or None.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it moves and does not mimic another joint."""
+        """Whether the joint moves and does not mimic another joint."""
         return self.type != "fixed" and self.mimic is None
 
 
@@ -118,8 +118,8 @@ class RobotDescription:
 
     Attributes:
         name: Name of the robot.
-        links: Its links in the order of the file.
-        joints: Its joints in the order of the file.
+        links: Links in the order of the file.
+        joints: Joints in the order of the file.
     """
 
     name: str
@@ -143,11 +143,12 @@ def read_urdf(path: Path) -> RobotDescription:
 
 
 def describe_urdf(path: Path, refusals: Refusals) -> RobotDescription:
-    """Describe the parts of a URDF file that are accepted.
+    """Describe the accepted parts of a URDF file.
 
     Args:
         path: The file.
-        refusals: Gets the reasons against the others. The links make a tree if it gets none.
+        refusals: Collects the reasons against refused parts. Without a reason, the links form a
+            tree.
 
     Raises:
         InvalidInput: If the file is not safe or well-formed XML, or describes no robot.
@@ -198,7 +199,7 @@ def _parsed(path: Path, data: bytes) -> Element:
     except SAXParseException as error:
         place = f"line {error.getLineNumber()}, column {error.getColumnNumber()}"
         raise InvalidInput(f"{path}: not well-formed XML: {error.getMessage()}: {place}") from error
-    except (ValueError, LookupError) as error:  # encodings
+    except (ValueError, LookupError) as error:  # unknown or wrong encoding
         raise InvalidInput(f"{path}: not well-formed XML: {error}") from error
     return builder.tree.close()
 
@@ -223,7 +224,7 @@ def _number(element: Element | None, attribute: str) -> float:
 
 
 def _frame(owner: Element | None) -> FloatArray:
-    """Frame [4, 4] of the <origin>: turned about the fixed axes x, then y, then z."""
+    """Frame [4, 4] of the <origin>: rotation about the fixed axes x, then y, then z."""
     frame = np.eye(4)
     origin = None if owner is None else owner.find("origin")
     if origin is None:
@@ -258,7 +259,7 @@ def _link(link: Element) -> Link:
 
 def _shape(collision: Element) -> Shape:
     (shape,) = collision.iterfind("geometry/*")
-    # The document has attributes in the order of its grammar.
+    # The reduced document has attributes in the order of the grammar.
     fields = [field for field in shape.attrib if field != "filename"]
     return Shape(
         kind=shape.tag,
@@ -297,7 +298,7 @@ def _joint(file: str, joint: Element) -> Joint:
     if mimic is not None and kind != "fixed":
         follows = mimic.attrib["joint"], _number(mimic, "multiplier"), _number(mimic, "offset")
     parent, child = (joint.find(tag) for tag in ("parent", "child"))
-    assert parent is not None  # the document has both
+    assert parent is not None  # the grammar requires both
     assert child is not None
     return Joint(
         name=name,
@@ -309,7 +310,7 @@ def _joint(file: str, joint: Element) -> Joint:
         lower=lower,
         upper=upper,
         viscosity=_number(given["dynamics"], "damping"),
-        # Files write 0 where they have no limit.
+        # URDF files use 0 for no limit.
         effort=_number(limit, "effort") or math.inf,
         velocity=_number(limit, "velocity") or math.inf,
         friction=_number(given["dynamics"], "friction"),

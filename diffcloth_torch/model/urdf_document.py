@@ -1,4 +1,4 @@
-"""The elements and attributes of a URDF file that are read, each with what it accepts."""
+"""The elements and attributes of URDF files that are read, each with its accepted values."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _LONGEST_WORD = 1000
 
 
 class _Attribute(NamedTuple):
-    """The accepted text of an attribute, which is required unless it has a default."""
+    """The accepted text of an attribute; an attribute without a default is required."""
 
-    numbers: int = 0  # how many; 0: a word
+    numbers: int = 0  # number of numbers; 0: a word
     default: str | None = None
     accepted: Range = ANY_NUMBER
-    words: tuple[str, ...] = ()  # the accepted ones, where not all are
+    words: tuple[str, ...] = ()  # accepted words; empty: all
 
 
 class _Child(NamedTuple):
@@ -126,21 +126,21 @@ def reduced(
     grammar: _Element = _ROBOT,
     above: Sequence[str] = (),
 ) -> Element:
-    """Copy and check what the grammar knows of an element; the rest is ignored.
+    """Copy and check the parts of an element that the grammar contains; the rest is ignored.
 
     Args:
-        file: Opens messages.
+        file: Start of messages.
         node: The element.
-        refusals: Gets every reason against the element and what it holds.
-        grammar: Its grammar.
-        above: The elements that hold it.
+        refusals: Collects every reason against the element and its contents.
+        grammar: Grammar of the element.
+        above: The enclosing elements, from the outside.
 
     Returns:
-        The copy, without those children that are not accepted.
+        The copy, without the children that are not accepted.
     """
     name = node.get("name")
     here = (*above, f"<{node.tag}>" if name is None else f"<{node.tag} name={name!r}>")
-    where = file + " ".join(here[1:] or here)  # <robot> goes without saying
+    where = file + " ".join(here[1:] or here)  # <robot> is implied
     copy = Element(node.tag)
     for key, attribute in grammar.attributes.items():
         with refusals.collected():

@@ -1,4 +1,4 @@
-"""The one optimization loop: simulate, differentiate, and let an optimizer of torch step."""
+"""The optimization loop: simulate, differentiate, and make a step of a torch optimizer."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from diffcloth_torch.reprs import dataclass_text
 __all__ = ["Descent", "Optimizers", "TrialError", "descend"]
 
 Optimizers = torch.optim.Optimizer | Callable[[list[Tensor]], torch.optim.Optimizer]
-"""An optimizer of the variables, or what makes one of them."""
+"""An optimizer of the variables, or a function from a list of them to an optimizer."""
 
 
 class TrialError(SimulationError):
-    """Raised by `simulate` or `loss` of `descend` to have a trial taken back, whatever failed."""
+    """Raised by `simulate` or `loss` of `descend` to reject a trial for any reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """The results of a loop so far, and the state that it needs to continue.
+    """The results of a loop so far, and the state for a continuation.
 
     Attributes:
         first: Evaluation of the initial variables, without its states.
@@ -57,9 +57,10 @@ class Descent:
         next_variables: Variables of the next iteration.
         optimizer: State dict of the optimizer.
         random_state: State of the generator.
-        best_rows: Variable that is `per_environment` -> rows with the smallest loss of each
+        best_rows: Name of a variable in `per_environment` -> rows with the smallest loss of each
             environment.
-        best_losses: These losses, shape [B]; infinite for environments without one.
+        best_losses: Smallest loss of each environment, shape [B]; infinite for environments
+            without a loss.
     """
 
     first: Evaluation
@@ -84,7 +85,7 @@ class Descent:
         """Make a Descent from its `record`.
 
         Raises:
-            InvalidInput: If the record has anything else than `record` returns.
+            InvalidInput: If the contents of the record differ from a result of `record`.
         """
         names = [field.name for field in fields(Descent)]
         check_like("the record", dict.fromkeys(record), dict.fromkeys(names))
@@ -96,14 +97,14 @@ class Descent:
         check_generator("the random state", record["random_state"])
         shapes = {name: variables[name] for name in record["best_rows"]}
         check_like("the best rows", record["best_rows"], shapes)
-        # Infinite for environments without a loss.
+        # Only the structure is checked: losses are infinite for environments without a loss.
         check_structure("the record", {"losses": losses}, {"losses": cpu.zeros(len(losses))})
         parts = {"state": None, "param_groups": None}
         check_like("the optimizer", dict.fromkeys(record["optimizer"]), parts)
         return Descent(**{**record, "first": first, "best": best})
 
     def metrics(self) -> dict[str, Any]:
-        """Return the numbers of the loop, in types that JSON has."""
+        """Return the numbers of the loop, in types of JSON."""
         losses = [record["loss"] for record in self.history]
         distances = [
             record["minimum_distance"]
@@ -158,42 +159,42 @@ def descend(
     ...     iterations=50,
     ... )
 
-    The variables are changed in place, as by all optimizers; `found.best.variables` are those with
-    the smallest loss.
+    The variables are changed in place, as by all optimizers; `found.best.variables` has the values
+    with the smallest loss.
 
-    If a rollout fails, by an error or by a status that `SolverOptions(throw=False)` returns, the
-    variables move half way back to the best ones and are tried again, without momentum. If the loss
-    has one number for each environment of a batch, failed environments are left out of it: their
-    rows of variables that are `per_environment` move half way back, and all other variables follow
-    the environments that are left.
+    If a rollout fails, by an error or by a status under `SolverOptions(throw=False)`, the variables
+    move halfway back to the best variables and are tried again, without momentum. If the loss has
+    one number for each environment of a batch, it leaves failed environments out: their rows of
+    `per_environment` variables move halfway back, and all other variables follow the remaining
+    environments.
 
     Args:
-        simulate: Function from the variables to the states that the loss depends on; usually a
-            `rollout`.
+        simulate: Function from the variables to the states for the loss; usually a `rollout`.
         loss: Function from these states to a loss of shape [], or of shape [B] with one number for
             each environment, whose mean is minimized.
         variables: Name -> leaf tensor of floats that requires a gradient.
-        optimizer: Optimizer of torch over exactly these tensors, or a function that makes one from
-            their list. Optimizers that evaluate the loss themselves, such as LBFGS, are refused.
-        iterations: Number of evaluations that do not fail, including those of `found`, >= 1.
-        per_environment: Names of variables whose row i acts in environment i alone. Each row
-            follows the loss of its own environment, with a `clip` and a `restart` of its own.
+        optimizer: Optimizer of torch over exactly these tensors, or a function from their list to
+            such an optimizer. Optimizers that evaluate the loss themselves, such as LBFGS, are
+            refused.
+        iterations: Number of evaluations that do not fail, including evaluations of `found`, >= 1.
+        per_environment: Names of variables whose row i acts only in environment i. Each row follows
+            the loss of its own environment; `clip` and `restart` apply to each row separately.
         clip: Largest norm of the gradient of each variable, > 0; None does not clip.
-        restart: Whether to reset the optimizer's momentum whenever the loss has risen, so that it
-            does not swing across a narrow valley.
+        restart: Whether to reset the optimizer's momentum whenever the loss has risen, to prevent
+            oscillations across a narrow valley.
         failures: Number of successive attempts that may fail, >= 0.
         stop_below: Loss, > 0, below which the loop ends if no environment of the best evaluation
             failed.
         report: Called after each iteration with the results so far.
-        found: Results that an earlier loop reported, to continue it. Variables, optimizer and
-            generator are set to their state in it; the result has the same bits as without the
-            interruption.
+        found: Results reported by an earlier loop, to continue that loop. Variables, optimizer and
+            generator are set to their states in `found`; the result has the same bits as without
+            the interruption.
         generator: Generator from which `simulate` and `loss` draw random numbers; torch's own by
             default.
         progress: Progress bar of the caller.
 
     Returns:
-        The best evaluation and the history of all of them.
+        The best evaluation and the history of all evaluations.
 
     Raises:
         SimulationError: If the initial variables fail, or too many successive attempts do.
@@ -285,7 +286,7 @@ class _Loop:
             rows.restore(found.best_rows, found.best_losses)
 
     def go_back(self, error: SimulationError) -> None:
-        """Move the variables half way back to the best ones."""
+        """Move the variables halfway back to the best variables."""
         self._failed_in_a_row += 1
         self._note(f"{type(error).__name__}: {error}")
         if self.found is None or self._failed_in_a_row > self._allowed:
@@ -296,7 +297,7 @@ class _Loop:
         self._optimizer.state.clear()
 
     def advance(self, evaluation: Evaluation) -> Descent:
-        """Take an optimizer step by the gradients of an evaluation."""
+        """Make an optimizer step with the gradients of an evaluation."""
         self._failed_in_a_row = 0
         failed = evaluation.failed_environments
         if failed:
@@ -307,7 +308,7 @@ class _Loop:
         if self._restart:
             self._forget(risen)
         self._clip_gradients()
-        with cpu.DEVICE:  # where optimizers keep their counts
+        with cpu.DEVICE:  # some optimizers create counters on torch's default device
             self._optimizer.step()
         self._rows.go_back(evaluation, self._optimizer)
         found = self.found
@@ -360,7 +361,7 @@ def _put(variables: Variables, values: Variables) -> None:
 
 
 def _detached(value: Any) -> Any:
-    """A copy of a state dict, which shares its tensors with the optimizer."""
+    """A copy of a state dict; the original shares its tensors with the optimizer."""
     if isinstance(value, Tensor):
         return value.detach().clone()
     if isinstance(value, dict):
@@ -403,7 +404,7 @@ def _optimizer(given: Optimizers, variables: Variables) -> torch.optim.Optimizer
             "descend: `optimizer` must be an optimizer of torch or make one, "
             f"got {type(given).__name__}"
         )
-    with cpu.DEVICE:  # some optimizers keep numbers from the beginning
+    with cpu.DEVICE:  # some optimizers create tensors in their constructor
         made: Any = given if isinstance(given, torch.optim.Optimizer) else given(tensors)
     if not isinstance(made, torch.optim.Optimizer):
         raise TypeError(

@@ -34,10 +34,10 @@ from diffcloth_torch.sim.records.state import State
 
 __all__ = ["outline", "silhouettes"]
 
-_ROUNDING = 1e-9  # of shares of an edge
+_ROUNDING = 1e-9  # tolerance of the share of an edge at which a ray crosses it
 _NOT_CROSSED = 1e-300  # cross product below which an edge lies along a ray
-_ROUND = 1e-9  # relative size of a wave below which an outline is a circle: no turn changes it
-_PER_WAVE = 4  # directions, at least, for each wave that tells how an outline is turned
+_ROUND = 1e-9  # relative size of a wave below which an outline is a circle without orientation
+_PER_WAVE = 4  # smallest number of directions per wave that determines the orientation
 
 
 def outline(
@@ -50,31 +50,31 @@ def outline(
     noise: float = 1.0,
     turned: bool = False,
 ) -> Tensor:
-    """Radius of the silhouette seen from above less that observed, over the noise.
+    """Simulated minus observed radii of silhouettes seen from above, divided by the noise.
 
     A camera above a draped disk, or a photograph of its shadow, shows an outline. Along each of
     some directions from the center, the silhouette ends where the last edge of the cloth crosses
-    the ray. Which edge that is, is held fixed by derivatives.
+    the ray. Derivatives keep the choice of this edge fixed.
 
-    Around a round pedestal, chance decides where the folds of a disk are. With `turned`, each
-    silhouette is turned about the center until its largest wave (three folds: the third harmonic of
-    the radius) has the phase of that which was observed; which of the folds comes first, is decided
-    by the smallest sum of squares. Derivatives know of the turn. They say nothing where the number
-    of folds differs: start from a sheet with as many as were observed.
+    Around a round pedestal, chance decides the places of a disk's folds. With `turned`, each
+    silhouette is rotated about the center until its largest wave (three folds: the third harmonic
+    of the radius) has the phase of the observed wave; among the rotations by whole folds, the one
+    with the smallest sum of squares is used. Derivatives include the rotation. They have no meaning
+    if the number of folds differs: start from a sheet with the observed number of folds.
 
     Args:
         states: T states without a batch axis, one for each outline.
-        outlines: Of each state the corners of the observed outline, x and y [m] in order, shape
-            [n, 2], at least three; from a photograph, after its scale and perspective are undone.
+        outlines: For each state, the corners of the observed outline, x and y [m] in order, shape
+            [n, 2], at least three; for a photograph, after correction of scale and perspective.
         faces: Triangles of the cloth, rows of the positions, shape [F, 3].
-        center: A point x, y [m] that the silhouettes contain, as the middle of the pedestal.
+        center: A point x, y [m] inside the silhouettes, such as the middle of the pedestal.
         directions: Number of directions, >= 3, the first along x, evenly around z; with `turned` at
             least four for each fold.
         noise: Standard deviation of a radius [m], > 0.
-        turned: Whether silhouettes may be turned about the center.
+        turned: Whether silhouettes may be rotated about the center.
 
     Returns:
-        Residuals [T * directions] without unit; they have derivatives.
+        Differentiable residuals [T * directions], without unit.
 
     Raises:
         InvalidInput: If a shape or value is not accepted, or a silhouette leaves a direction empty.
@@ -134,7 +134,7 @@ def silhouettes(
 def _flattened(
     owner: str, states: Sequence[State], faces: object, center: FloatArray
 ) -> tuple[Tensor, Any]:
-    """Vertices seen from above [T, N, 2], from the center, and the edges between them [E, 2]."""
+    """Vertices seen from above [T, N, 2], relative to the center, and their edges [E, 2]."""
     positions = positions_of(owner, states)
     triangles = index_array(f"{owner}: `faces`", faces, positions.shape[1])
     if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
@@ -164,11 +164,11 @@ def _observed(name: str, outline: object, center: FloatArray, rays: Tensor) -> T
 def _turned(
     owner: str, points: Tensor, edges: Any, found: Tensor, observed: Tensor
 ) -> tuple[Tensor, float]:
-    """Radii of a silhouette that is turned as the observed one is, shape [D], and the angle.
+    """Radii of a silhouette, rotated to the observed orientation, shape [D], and the angle.
 
-    The radius r(a) = sum_k c_k exp(i k a) has waves c_k, and so has the observed one, d_k. With
-    the angle b = (arg d_m - arg c_m) / m the largest of them, m, agrees: r(a + b) has the phase of
-    d_m, and so it has with b + 2 pi j / m, for the m folds j.
+    The radius r(a) = sum_k c_k exp(i k a) has waves c_k, and the observed radius has waves d_k. Let
+    d_m be the largest observed wave. With the angle b = (arg d_m - arg c_m) / m, the wave m of
+    r(a + b) has the phase of d_m, and also with b + 2 pi j / m, for the m folds j.
     """
     count = len(observed)
     waves, seen = _waves(found), _waves(observed)
@@ -204,11 +204,10 @@ def _phase(wave: Tensor) -> Tensor:
 
 
 def _radii(owner: str, points: Tensor, edges: Any, rays: Tensor) -> Tensor:
-    """Distance along each ray from the origin to the last edge that crosses it, shape [D].
+    """Distance along each ray from the origin to the last edge that crosses the ray, shape [D].
 
-    The point a + s (b - a) of an edge lies on the line of the ray d if
-    d x a + s d x (b - a) = 0, with the cross product of the plane; it belongs to the edge if
-    0 <= s <= 1.
+    The point a + s (b - a) lies on the line of the ray d if d x a + s d x (b - a) = 0, with the
+    cross product of the plane; the point belongs to the edge if 0 <= s <= 1.
     """
     flat, along = numbers_of(points), numbers_of(rays)
     found, share = _crossings(flat[edges[:, 0]], flat[edges[:, 1]], along)
@@ -228,7 +227,7 @@ def _radii(owner: str, points: Tensor, edges: Any, rays: Tensor) -> Tensor:
 
 
 def _crossings(a: FloatArray, b: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance along each ray to each edge, and the share of the edge before it, [D, E] each."""
+    """Distance along each ray to each edge, and share of the edge before it, [D, E] each."""
     across = b - a
     above = rays[:, :1] * a[:, 1] - rays[:, 1:] * a[:, 0]
     below = rays[:, :1] * across[:, 1] - rays[:, 1:] * across[:, 0]

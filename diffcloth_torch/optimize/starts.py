@@ -1,4 +1,4 @@
-"""One start of a fit: its stages, one after the other, and how it ended; several in processes."""
+"""One start of a fit: its stages, one after the other, and its end; several in processes."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ from diffcloth_torch.worker import note_progress
 
 __all__ = ["End", "Job", "Stage", "Start", "judge", "run", "run_all"]
 
-# Ends closer than this share of a standard error, or of their own size, are one place.
+# Two ends are the same minimum if they are closer than this share of a standard error plus this
+# share of their size.
 _SAME_ERROR, _SAME_SIZE = 0.1, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A part of a fit, with residuals of its own; the next stage begins where it ends.
+    """A part of a fit, with its own residuals; the next stage begins at its end.
 
     Attributes:
-        residuals: As those of `fit`.
-        free: Names of the variables that it changes; None means all that are free.
+        residuals: Function of the residuals, as in `fit`.
+        free: Names of the variables that the stage changes; None means all free variables.
     """
 
     residuals: Residuals
@@ -46,16 +47,17 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a start of a fit began and ended.
+    """First values and end of one start of a fit.
 
     Attributes:
-        first: Values of all variables where it began.
-        values: Where it ended; those of `first` if the simulation failed there.
-        cost: Half the sum of squares there, priors included; infinite if the simulation failed.
+        first: First values of all variables.
+        values: Values at the end; the values of `first` if the simulation failed there.
+        cost: Half the sum of squares at the end, priors included; infinite if the simulation
+            failed.
         evaluations: Number of evaluations of the residuals.
         success: Whether the solver converged in every stage.
-        message: How it ended.
-        apart: Why it did not end at the best place; empty if it did.
+        message: Reason of the end.
+        apart: Reason why the start did not end at the best minimum; empty if it did.
     """
 
     first: dict[str, Tensor]
@@ -71,14 +73,14 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What the starts of a fit have in common; may be sent to another process.
+    """Common data of the starts of a fit; may be sent to another process.
 
     Attributes:
-        space: What is searched.
-        stages: One or more; the last one frees everything.
-        options: How each stage is solved.
-        folder: Where evaluations are kept, or None.
-        threads: Of torch: sums of its larger operations depend on it.
+        space: The searched space.
+        stages: One or more stages; the last stage frees all variables.
+        options: Options of the solver of each stage.
+        folder: Folder of saved evaluations, or None.
+        threads: Number of threads of torch, on which rounding in its larger sums depends.
     """
 
     space: Space
@@ -93,12 +95,13 @@ class End:
     """The end of a start.
 
     Attributes:
-        start: Its index.
-        first: Theta where it began.
-        theta: Where it ended.
-        cost: Infinite if the simulation failed at the first values of a stage.
-        residuals: There, without those of priors.
-        jacobian: Theirs.
+        start: Index of the start.
+        first: First theta.
+        theta: Theta at the end.
+        cost: Half the sum of squares; infinite if the simulation failed at the first values of a
+            stage.
+        residuals: Residuals at the end, without priors.
+        jacobian: Jacobian of these residuals.
         success: Whether the solver converged in every stage.
         message: How it ended.
         history: Its evaluations.
@@ -172,7 +175,7 @@ def run_all(
     deadline: float,
     report: Callable[[Trial], None],
 ) -> list[End]:
-    """Run all starts, here or in processes: each is the same computation wherever it runs."""
+    """Run all starts, here or in processes; a start has the same result in any process."""
     if workers == 0:
         return [run(job, k, first, report) for k, first in enumerate(firsts)]
     try:
@@ -209,7 +212,7 @@ def _work(job: Job, start: tuple[int, FloatArray]) -> End:
     before = torch.get_num_threads()
     torch.set_num_threads(job.threads)
     try:
-        # The trials are reported by the caller when the start has ended.
+        # The caller reports the trials after the end of the start.
         return run(job, *start, lambda _: note_progress())
     finally:
         torch.set_num_threads(before)

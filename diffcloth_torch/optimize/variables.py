@@ -41,23 +41,25 @@ _REACH = 1e3  # factor of what is positive, to both sides of its first value, wi
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """What a fit may change: its first value, and where it may go.
+    """A variable of a fit: its first value and its range.
 
     Attributes:
-        value: First value, a number or an array in the unit of what it stands for.
-        bounds: Lowest and highest value of each number. By default what is positive may change by a
-            factor of 1000, and all else has the accepted range of the parameter of its name.
-        scale: "log" searches the logarithm, so that steps are relative; "linear" the value itself.
-            By default "log" for parameters that cannot be negative, where all values are positive.
+        value: First value, a number or an array in the unit of the quantity.
+        bounds: Lowest and highest value of each number. By default a variable on the scale "log"
+            may change by a factor of 1000; any other variable has the accepted range of the
+            parameter of its name.
+        scale: "log" searches the logarithm, so steps are relative; "linear" searches the value
+            itself. By default "log" for parameters that cannot be negative, if all values are
+            positive.
         free: False keeps the value.
-        spread: Factor, > 1, by which the random starts of what is searched on the scale "log" may
-            differ from the first value; their logarithms are uniform. On the scale "linear" they
-            are uniform between the bounds, or up to twice the first value where these are infinite.
-        prior: What is known before anything is observed: (mean, deviation), numbers or arrays of
-            the shape of the value. On the scale "log" the deviation is that of the natural
-            logarithm: 0.1 is about 10 %. The fit weighs it against the residuals, as one more
-            observation of that standard deviation, and draws the random starts from it. None knows
-            nothing but the bounds.
+        spread: Factor, > 1, by which random starts on the scale "log" may differ from the first
+            value; their logarithms are uniform. On the scale "linear" random starts are uniform
+            between the bounds, or between zero and twice the first value if a bound is infinite.
+        prior: Knowledge before any observation: (mean, deviation), numbers or arrays of the shape
+            of the value. On the scale "log" the deviation is the deviation of the natural
+            logarithm: 0.1 is about 10 %. The fit weighs the prior against the residuals, as one
+            more observation of that standard deviation, and draws the random starts from it. None
+            means that only the bounds are known.
     """
 
     value: ArrayLike
@@ -159,7 +161,7 @@ def _digits(value: Tensor) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """A variable that is searched, and its rows in the vector of all numbers."""
+    """A free variable, and its rows in the vector theta of all numbers."""
 
     name: str
     shape: tuple[int, ...]
@@ -198,8 +200,8 @@ class Space:
             priors: Priors of several variables.
 
         Raises:
-            InvalidInput: If none is free.
-            TypeError: If something else than a variable is given.
+            InvalidInput: If no variable is free.
+            TypeError: If an entry is not a `Variable`.
         """
         if not isinstance(variables, Mapping):
             raise TypeError(
@@ -315,11 +317,11 @@ class Space:
 
     @property
     def default_bounds(self) -> list[str]:
-        """Variables whose bounds are a factor from their first value, as none were given."""
+        """Variables without given bounds, whose bounds are a factor from their first value."""
         return [axis.name for axis in self._axes if axis.log and axis.is_default]
 
     def rates(self, theta: FloatArray) -> FloatArray:
-        """Derivative of each number by its theta."""
+        """Derivative of each number with respect to its theta."""
         rates = np.ones(len(self))
         for axis in self._axes:
             if axis.log:
@@ -327,7 +329,7 @@ class Space:
         return rates
 
     def from_theta(self, theta: FloatArray) -> FloatArray:
-        """The numbers that theta stands for."""
+        """The numbers represented by theta."""
         numbers = np.array(theta)
         for axis in self._axes:
             if axis.log:
@@ -343,7 +345,7 @@ class Space:
         return distances
 
     def units(self, theta: FloatArray) -> FloatArray:
-        """What counts as a change of each theta by its own size."""
+        """Change of each theta that corresponds to its own size."""
         units = np.ones(len(self))
         for axis in self._axes:
             if not axis.log:

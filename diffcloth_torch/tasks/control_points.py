@@ -1,7 +1,7 @@
 """Control points: springs pull points of cloths along trajectories to targets, through contact.
 
-Nothing is optimized. The result is whether the cloths arrive without intersecting, and how far from
-their targets the points end.
+Nothing is optimized. The results are whether the cloths arrive without intersection, and the final
+distances of the points to their targets.
 
 References:
     The experiments "self-intersection" and "cloth and rigid body" of the paper, section V.B.
@@ -26,7 +26,7 @@ __all__ = ["ControlPoints", "ControlPointsConfig"]
 
 
 class ControlPointsConfig(RunConfig):
-    """A scene with soft pins, each group of which is a control point.
+    """A scene with soft pins; each group of soft pins is a control point.
 
     Targets are shown with the radius `marker_radius` [m].
     """

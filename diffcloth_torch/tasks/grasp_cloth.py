@@ -1,7 +1,7 @@
 """Grasp cloth: a robot grasps a cloth by friction and brings it into a target shape.
 
 For each control interval, the actions are velocities of a kinematic base or a force and a torque on
-a floating one, velocities of velocity joints, and efforts of torque and pd joints. The loss is the
+a floating base, velocities of velocity joints, and efforts of torque and pd joints. The loss is the
 L2 distance between the cloth and its target shape.
 
 References:
@@ -34,13 +34,13 @@ from diffcloth_torch.tasks.reach import (
 __all__ = ["GraspClothConfig", "GraspClothProblem"]
 
 _JOINTS = {"velocities": ("velocity",), "efforts": FORCED}
-"""Key of the actions -> how its joints must be actuated."""
+"""Key of the actions -> accepted actuations of its joints."""
 
 JointRows = dict[str, Annotated[list[float], Len(1)]]
 
 
 class RobotActionSection(RigidActionSection):
-    """The actions of one robot: of its base, and of its joints by their names.
+    """The actions of the base of one robot, and of its joints by name.
 
     `velocities` [rad/s or m/s] apply to velocity joints, `efforts` [N m or N] to torque and pd
     joints.
@@ -52,7 +52,7 @@ class RobotActionSection(RigidActionSection):
 
 
 class GraspClothConfig(ShapeConfig):
-    """A scene, the robot that acts in it, the target shape and how to get there."""
+    """A scene, the acting robot with its actions, the target shape, and the optimization."""
 
     actions: RobotActionSection
 

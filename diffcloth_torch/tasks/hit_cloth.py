@@ -37,7 +37,7 @@ class BodyActionSection(RigidActionSection):
 
 
 class HitClothConfig(ShapeConfig):
-    """A scene, the body that acts in it, the target shape and how to get there."""
+    """A scene, the acting body with its actions, the target shape, and the optimization."""
 
     actions: BodyActionSection
 

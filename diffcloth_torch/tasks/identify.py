@@ -1,4 +1,4 @@
-"""Identify: fit parameters of a scene to what was observed of it."""
+"""Identify: fit parameters of a scene to observations of its motion or equilibrium."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from diffcloth_torch.viewers.fitted import Track
 
 __all__ = ["Identify", "Observations"]
 
-_VELOCITY = "velocity"  # the one variable that is no parameter: of all vertices without pins
-_LARGEST_OBSERVATION = 256 << 20  # bytes of a file: an hour of a camera with a hundred markers
-_SAME_POINT = 1e-6  # of the size of a mesh: vertices of two meshes are one material point
+_VELOCITY = "velocity"  # initial velocity of all vertices without pins; not a parameter
+_LARGEST_OBSERVATION = 256 << 20  # bytes of a file: one hour of video with a hundred markers
+_SAME_POINT = 1e-6  # largest distance of vertices of two meshes at one material point, over size
 
 
 class Identify(ConfiguredTask):
-    """A scene that moves as its configuration says, and observations to fit it to."""
+    """A scene with the motion of its configuration, and the observations for the fit."""
 
     Config = FitConfig
 
@@ -121,9 +121,9 @@ class Identify(ConfiguredTask):
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A scene and how a trajectory moves it.
+    """A scene with the motion of a trajectory.
 
-    A `velocity` is that of the real start: in free fall x(t) = v t + g t^2 / 2 at all steps.
+    `velocity` is the velocity at the real start: in free fall x(t) = v t + g t^2 / 2 at all steps.
     """
 
     task: ConfiguredTask
@@ -131,7 +131,7 @@ class _Motion:
     steps: list[int] | None  # None: at equilibrium
 
     def simulate(self, values: Mapping[str, Tensor]) -> list[State]:
-        """The states that are observed, at values of the variables."""
+        """Simulate the observed states at values of the variables."""
         simulator, start = self.task.simulator, self.task.initial_state()
         given: dict[str, Any] = {n: v for n, v in values.items() if n in PARAMETERS}
         parameters = simulator.default_parameters().replace(**given)
@@ -156,7 +156,7 @@ class _Motion:
 
 @dataclass(frozen=True, eq=False)
 class _Observed:
-    """A motion, and what was seen of it."""
+    """A motion and its observations."""
 
     section: TrajectorySection
     motion: _Motion
@@ -164,11 +164,11 @@ class _Observed:
     seen: FloatArray
 
     def residuals(self, values: Mapping[str, Tensor]) -> Tensor:
-        """What is simulated less what was seen, over the noise."""
+        """Differences of simulation and observations, divided by the noise."""
         return self._compare(self.motion.simulate(values))
 
     def track(self, values: Mapping[str, Tensor]) -> Track:
-        """What is simulated, and beside it what was seen."""
+        """The simulated states and their observations, for a viewer."""
         with torch.no_grad(), noting() as notes:
             states = self.motion.simulate(values)
             self._compare(states)
@@ -274,7 +274,7 @@ def _synthesize(
     motion: _Motion,
     vertices: list[int],
 ) -> FloatArray:
-    """Simulate what was observed, on a mesh of its own, and add noise."""
+    """Simulate synthetic observations, on a mesh of their own, and add noise."""
     where = f"{source}: `fit.trajectories.{section.name}.synthetic`"
     for name in synthetic.values:
         _check_name(where, name)
@@ -306,7 +306,7 @@ def _synthesize(
 def _same_points(
     where: str, task: ConfiguredTask, other: ConfiguredTask, vertices: list[int]
 ) -> list[int]:
-    """Vertices of another mesh at the material points of these, which are those at rest."""
+    """Vertices of another mesh at the same material points, by their rest positions."""
     from scipy.spatial import cKDTree
 
     mine, theirs = (np.asarray(t.scene.cloths[0].rest_positions) for t in (task, other))

@@ -33,7 +33,7 @@ def optimize(
     Args:
         task: The task.
         report: Called after each iteration with the results so far.
-        start: Actions to start from, leaf tensors; by default those of the task.
+        start: Actions to start from, leaf tensors; by default the task's actions.
         found: Results that an earlier loop over the same task reported, to continue it.
 
     Raises:
@@ -44,7 +44,7 @@ def optimize(
     actions = task.actions() if start is None else start
     optimizer = _optimizer(actions, options)
     if found is not None:
-        # The options may have changed since.
+        # The configuration may have changed since the interruption.
         groups = optimizer.state_dict()["param_groups"]
         found = replace(found, optimizer={**found.optimizer, "param_groups": groups})
     with Progress(options.iterations, task.steps, "step") as progress:
@@ -72,7 +72,7 @@ def evaluate(task: OptimizableTask, actions: Actions) -> Evaluation:
 def position_gradients(task: OptimizableTask, actions: Mapping[str, Tensor]) -> list[Tensor]:
     """Gradients of the loss of a task by the positions after each step, [N, 3] each.
 
-    Each is the whole derivative: what moves at a step also moves all that follows.
+    Each gradient is a total derivative: a change of positions changes all later states.
     """
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in actions.items()}
     states = _simulation(task, lambda _: None)(leaves)
@@ -86,7 +86,7 @@ def _simulation(task: OptimizableTask, on_step: Callable[[int], None]) -> Simula
         forward = True
 
         def control_at(k: int, state: State) -> Control:
-            if forward:  # backward asks for repeated steps again
+            if forward:  # backward repeats steps of a checkpointed rollout
                 on_step(k)
             return controller(k, state)
 

@@ -53,7 +53,7 @@ class PositionSection(Section):
 
 
 class PushCubeConfig(ReachConfig):
-    """A scene, the pins that act in it, the body that they push, and its target."""
+    """A scene, the acting pins, the pushed body, and its target."""
 
     actions: PinActionSection
     target: PositionSection
@@ -76,7 +76,7 @@ class PushCubeConfig(ReachConfig):
 
 @dataclass(frozen=True)
 class _Moved:
-    """Displaced positions [p, 3] of pins, made for each step: those of all steps would be many."""
+    """Displaced positions [p, 3] of pins, made for one step at a time to save memory."""
 
     start: Tensor
     displacements: Tensor

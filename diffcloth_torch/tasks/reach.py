@@ -1,4 +1,4 @@
-"""Common parts of tasks that bring something to a target: rows of actions, and a distance."""
+"""Common parts of tasks that reach a target: rows of actions, and a distance."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 Rows = Annotated[list[Vector3], Len(1)]
-"""Vectors, one for each control interval, or one for all."""
+"""Vectors: one for each control interval, or one for all."""
 
 
 class ActionSection(Section):
@@ -85,7 +85,7 @@ class ReachConfig(RunConfig):
 
 
 class Reach(OptimizableTask):
-    """A task in which actions bring something to a target.
+    """A task in which actions move a body or a cloth to a target.
 
     The start must make contact: without contact there is no gradient. Subclasses have a `Config`
     and define the actions, their motions, and the distance to the target.
@@ -159,9 +159,9 @@ def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
 class RigidActionSection(ActionSection):
     """Actions on a rigid body, or on the base of a robot.
 
-    Either `linear` [m/s] and `angular` [rad/s] velocities if it is kinematic, or `force` [N] at the
-    center of mass (of the root link) and `torque` [N m] if it is dynamic or floating; all in world
-    axes.
+    Either `linear` [m/s] and `angular` [rad/s] velocities of a kinematic body or base, or `force`
+    [N] at the center of mass (of the root link) and `torque` [N m] on a dynamic body or floating
+    base; all in world axes.
     """
 
     linear: Rows | None = None
@@ -170,7 +170,7 @@ class RigidActionSection(ActionSection):
     torque: Rows | None = None
 
     def rigid_rows(self) -> dict[str, list[list[float]]]:
-        """The given ones of the four fields."""
+        """The fields among the four that are set."""
         rows: dict[str, list[list[float]]] = self.model_dump(include=set(_RIGID), exclude_none=True)
         return rows
 
@@ -187,7 +187,7 @@ def rigid_motion(
         actions: Either `linear` [m/s] and `angular` [rad/s] velocities, or `force` [N] at the
             center of mass and `torque` [N m], in world axes, shape [steps, 3].
         name: Name of the body or robot.
-        start: Its pose at the start, shape [7].
+        start: Pose of the body or base at the start, shape [7].
         dt: Time step [s].
         kind: "body" or "base".
     """
@@ -219,7 +219,7 @@ Named = TypeVar("Named", ClothSection, BodySection, RobotSection)
 
 
 def find_named(key: str, name: str, sections: Sequence[Named]) -> Named:
-    """Find the section of the scene that a key names."""
+    """Find the section of the scene with the name in a key."""
     for section in sections:
         if section.name == name:
             return section

@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 DICT = "dict"
-"""Stands for the file of a configuration that is none, in messages and in the current folder."""
+"""Path of a configuration that is no file: used in messages and for the current folder."""
 
 TASKS: dict[str, Any] = {
     "drape": ConfiguredTask,
@@ -41,7 +41,7 @@ TASKS: dict[str, Any] = {
     "control_points": ControlPoints,
     "identify": Identify,
 }
-"""Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
+"""Name -> class with a `Config`; its constructor has a `Config` and its path as arguments."""
 
 
 def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
@@ -111,7 +111,7 @@ def load_task(path: str | Path, assignments: Iterable[str] = ()) -> ConfiguredTa
 def load_document(document: Mapping[str, Any], assignments: Iterable[str] = ()) -> ConfiguredTask:
     """Build the scene, simulator and task of a configuration that is no file.
 
-    Files that it names are relative to the current folder.
+    File names in the configuration are relative to the current folder.
 
     Raises:
         InvalidInput: If a key or a value is not accepted.

@@ -18,7 +18,7 @@ from diffcloth_torch.model.scene import Scene
 __all__ = ["grid_changes", "pose_of", "scene_of", "sections_of"]
 
 _FILES = {file.stem: file for file in Path(__file__).parent.glob("*.yaml")}
-_ANY = {"dt": 1.0, "steps": 1}  # of a simulation that the scene does not depend on
+_ANY = {"dt": 1.0, "steps": 1}  # arbitrary values, which the scene does not depend on
 
 
 def sections_of(task: str) -> Document:
@@ -34,7 +34,7 @@ def scene_of(task: str, changes: Iterable[str] = ()) -> tuple[Scene, Document]:
         changes: "key=value" each, as after `--set`.
 
     Returns:
-        The scene, and the sections that it was built from.
+        The scene, and the sections from which it was built.
     """
     sections = set_values(sections_of(task), changes)
     document = {"task": task, "simulation": _ANY, "scene": sections["scene"]}

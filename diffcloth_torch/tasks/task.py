@@ -28,7 +28,7 @@ __all__ = ["Actions", "ConfiguredTask", "Controller", "LoadedConfig", "Optimizab
 
 Actions = dict[str, Tensor]
 Controller = Callable[[int, State], Control]
-"""From the index of a step and the state before it to its control."""
+"""Function of the index of a step and the state before the step; returns the control."""
 
 
 class ConfiguredTask:
@@ -65,8 +65,8 @@ class ConfiguredTask:
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Make a function that returns the control of a step under the given actions.
 
-        For the same arguments it returns the same control, because checkpointed rollouts repeat
-        steps.
+        The function returns the same control for the same arguments, because checkpointed rollouts
+        repeat steps.
         """
         return lambda k, _state: step_control(self._motions, k, self._wind)
 
@@ -94,7 +94,7 @@ class LoadedConfig(NamedTuple):
 
     Attributes:
         scene: Cloths, bodies and robots.
-        simulator: Steps the scene.
+        simulator: Simulator of the scene.
         task: Control and objective of the scene.
     """
 

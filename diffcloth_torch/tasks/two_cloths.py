@@ -1,6 +1,6 @@
 """Two cloths, hooked into each other, are pulled apart until one reaches its target.
 
-A constant force pulls one cloth. The actions are forces on the other, one for each control
+A constant force pulls one cloth. The actions are forces on the other cloth, one for each control
 interval. The loss is the distance between the center of a cloth, the mean of its vertices, and its
 target.
 
@@ -63,7 +63,7 @@ class CenterSection(Section):
 
 
 class TwoClothsConfig(ReachConfig):
-    """A scene, the forces that act in it, and the target of a cloth's center."""
+    """A scene, the forces in it, and the target of a cloth's center."""
 
     pull: PullSection
     actions: ForceActionSection
@@ -111,7 +111,7 @@ class TwoClothsProblem(Reach):
         return {"force": self._force}
 
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:
-        """Have no prescribed motion."""
+        """Return no prescribed motion."""
         return {}
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
