@@ -1,4 +1,4 @@
-"""The command line: what it writes, and how it ends."""
+"""The command line: its files, messages and exit status."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def test_the_module_runs():
     ],
 )
 def test_what_needs_no_simulation_reads_no_torch(arguments, code):
-    """It takes seconds to import."""
+    """Importing torch needs seconds."""
     script = (
         "import sys\n"
         "from diffcloth_torch.cli import main\n"
@@ -247,7 +247,7 @@ def test_the_commands_import_nothing_that_only_pictures_need():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- results that are there already -------------------------------------------------------------
+# --- existing results ---------------------------------------------------------------------------
 
 
 def test_results_are_not_overwritten_unless_told(call, tmp_path):
@@ -302,7 +302,7 @@ class Interrupt:
         def interrupted(real):
             def step(*args, **kwargs):
                 taken.append(1)
-                if len(taken) == before + 1:  # once: the run that resumes takes all its steps
+                if len(taken) == before + 1:  # once: the resumed run completes all its steps
                     raise KeyboardInterrupt
                 return real(*args, **kwargs)
 
@@ -313,7 +313,7 @@ class Interrupt:
 
 
 def results(folder):
-    """What two runs have in common to the bit: no seconds."""
+    """Results that two runs share to the bit; times are omitted."""
     metrics = json.loads((folder / "metrics.json").read_text())
     with np.load(folder / "actions.npz") as arrays:
         actions = {name: arrays[name].tobytes() for name in arrays.files}
@@ -387,7 +387,7 @@ def test_resume_takes_the_rest_from_its_folder(call):
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_configuration_comes_back_from_its_record(path):
-    if path.stem.startswith("train_"):  # of `diffcloth train`, with a schema of its own
+    if path.stem.startswith("train_"):  # of `diffcloth train`, with a separate schema
         config = validate(TrainConfig, read_document(path), path)
         assert validate(TrainConfig, config.model_dump(mode="json"), path) == config
         return
@@ -568,7 +568,7 @@ def test_actions_that_claim_more_than_there_is_take_no_memory(
 
 @pytest.mark.parametrize("command", ["run", "optimize"])
 def test_actions_on_a_pipe_are_refused(call, tmp_path, command):
-    """Nobody writes to it: reading it would wait without end."""
+    """The pipe has no writer: reading would wait forever."""
     os.mkfifo(tmp_path / "pipe.npz")
     arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--actions", "pipe.npz", "--out", "out"]
     result = call(command, *arguments)
@@ -576,7 +576,7 @@ def test_actions_on_a_pipe_are_refused(call, tmp_path, command):
     assert "pipe.npz: must be a regular file" in one_sentence(result)
 
 
-# --- what stands where results go -----------------------------------------------------------------
+# --- obstacles in the place of results ------------------------------------------------------------
 
 
 @pytest.fixture

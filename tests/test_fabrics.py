@@ -1,4 +1,4 @@
-"""Named fabrics: their numbers are those of the measurements, and each of them is a cloth."""
+"""Named fabrics: their numbers match the measurements, and each fabric makes a cloth."""
 
 from typing import get_args
 
@@ -20,7 +20,7 @@ def test_there_are_eight_and_configurations_know_them():
 
 
 def test_the_conversion_is_that_of_the_page():
-    """Of denim, by hand."""
+    """Expected values of denim computed by hand."""
     denim = dc.fabrics.material("denim")
     assert denim.density == 0.324
     assert (denim.stretch, denim.stretch_weft) == (1013.88629, 205.352005)
@@ -36,7 +36,7 @@ def test_a_quarter_is_the_stiffness_of_a_plate_of_hinges_on_equilateral_triangle
     """
     side, c, k = 1e-2, 0.1, 1.0
     height = np.sqrt(0.75) * side
-    area = height * side  # of two faces, and of what belongs to a vertex
+    area = height * side  # area of two faces, and of one vertex
     corners = np.array([[0.0, 0.0], [side, 0.0], [side / 2, height], [side / 2, -height]])
     for bent in np.linspace(0.0, np.pi, 7):
         energy = 0.0

@@ -1,4 +1,4 @@
-"""What public objects say of themselves: a few lines, and what is there."""
+"""Reprs of public objects: a few lines with the present fields."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_a_state_says_time_shapes_and_how_the_step_went(simulator, state):
     assert "body_poses=float64[2, 7]" in text
     assert "joint_positions=[" in text
     assert f"report=Report(converged=True, iterations={state.report.iterations}, ...))" in text
-    assert "soft_pin_targets" not in text  # there are none
+    assert "soft_pin_targets" not in text  # the scene has no soft pins
     assert "report=None" in lines(simulator.initial_state())
 
 

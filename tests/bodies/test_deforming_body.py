@@ -70,7 +70,7 @@ def test_environments_of_a_batch_move_apart():
 
 
 def test_it_has_no_mass_and_no_elasticity():
-    """A far one changes no bit of the motion of a sheet, however it deforms."""
+    """A distant deforming body changes no bit of a sheet's motion, for any deformation."""
     sheet = dc.Cloth.grid((5, 5), 0.3, name="sheet", pins={"edge": range(5)})
     far = ball(pose=[3, 0, 0, 1, 0, 0, 0])
     simulator = dc.Simulator(dc.Scene([sheet], [far]), 0.01)
@@ -125,7 +125,7 @@ def free(state, simulator, ipctk):
 
 @pytest.mark.parametrize("speed", [1.0, 10.0])
 def test_it_never_passes_through_cloth(speed):
-    """A punch of many edge lengths a step takes the sheet along."""
+    """A punch that moves by many edge lengths per step carries the sheet along."""
     ipctk = pytest.importorskip("ipctk")
     simulator = dropped(ball(), counts=(7, 7), dt=0.02)
     state = simulator.initial_state()
@@ -212,12 +212,12 @@ def test_a_dynamic_body_rests_on_it_and_is_dragged_along():
     for _ in range(20):
         moved = state.positions[rows] + torch.tensor([0.01, 0, 0])
         state = simulator.step(state, dc.Control(body_vertices={"belt": moved}))
-    # It rocks a little on its springs of contact.
+    # The body rocks slightly on the contact forces.
     assert state.body_velocities[0, 0].item() == pytest.approx(0.5 * G * 0.1, rel=0.03)
 
 
 def test_a_surface_that_widens_in_its_plane_drags_cloth_apart():
-    """Nothing of it moves at its center, and more the farther outwards: the sheet is stretched."""
+    """The belt's center rests and its speed grows outwards: the sheet is stretched."""
     belt = dc.DeformingBody.grid((9, 9), 0.5, name="belt", friction=1.0)
     soft = dc.Material(stretch=0.2, friction=1.0, bending=1e-4)
     sheet = dc.Cloth.grid((5, 5), 0.2, pose=[0, 0, 0.0125, 1, 0, 0, 0], material=soft)

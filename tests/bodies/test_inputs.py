@@ -1,4 +1,4 @@
-"""Controls, states and parameters of bodies and robots: names, defaults, what is refused."""
+"""Controls, states and parameters of bodies and robots: names, defaults, refused values."""
 
 import numpy as np
 import pytest
@@ -272,7 +272,7 @@ def test_state_tensors_are_checked(layout, scene, field):
 
 
 def test_a_joint_beyond_the_zone_of_its_limit_is_refused(layout, scene):
-    """Of joints that forces move: turn has the range -1 .. 1.8, where the one that follows ends."""
+    """Joints that forces move: `turn` has the range -1 .. 1.8, at which its mimic joint ends."""
     state = make_state(scene)
 
     def at(*positions):
@@ -407,7 +407,7 @@ def test_batched_parameters_have_one_axis_more(layout, defaults):
 
 
 def test_a_link_that_is_a_point_keeps_its_parameters(tmp_path):
-    """It has no inertia of its own, but the link that a fixed joint joins it to has."""
+    """The point has no inertia of its own; the link attached by a fixed joint has one."""
     point = '<inertial><mass value="1"/></inertial>'
     arm = point.replace("/></", '/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></')
     parts = [f'<link name="{n}">{own}</link>' for n, own in (("base", ""), ("arm", arm))]

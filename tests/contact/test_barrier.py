@@ -11,7 +11,7 @@ D_HAT = 1e-3
 
 
 def squared_distances(xi):
-    """Gaps from a hundredth of the activation distance to nearly all of it."""
+    """Squared distances for gaps from 0.01 to 0.95 of the activation distance."""
     return (xi + D_HAT * np.array([0.01, 0.1, 0.3, 0.5, 0.7, 0.95])) ** 2
 
 

@@ -1,4 +1,4 @@
-"""Environments for learning: interfaces, gradients, failures, seeds, and what policies get."""
+"""Environments for learning: interfaces, gradients, failures, seeds and observations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffcloth_torch.envs.env import Task
 NAMES = tuple(envs.TASKS)
 SMALL = 6  # vertices along a side
 
-# What users start from is not thrown by the barrier.
+# The barrier must not throw the cloth in start states.
 pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
 
 
@@ -86,7 +86,7 @@ def test_gradients_of_a_return_are_those_of_differences(name):
     (gradient,) = torch.autograd.grad(total(leaf), leaf)
     noise = torch.Generator().manual_seed(0)
     direction = torch.randn(leaf.shape, generator=noise, dtype=torch.float64)
-    # Not beyond the limits of actions, where they are cut.
+    # Actions beyond their limits are clipped; differences must not reach the limits.
     direction = direction * (leaf.detach().abs() < 0.95)
     expected = float((gradient * direction).sum())
     errors = []
@@ -231,7 +231,7 @@ def test_the_next_start_of_an_environment_does_not_depend_on_those_of_others():
 
 
 def test_failure_changes_no_bit_of_the_others(monkeypatch):
-    """Environment 1 fails in its third step; it begins anew."""
+    """Environment 1 fails in its third step and is reset."""
     from diffcloth_torch.envs import env as module
 
     results = []

@@ -26,7 +26,7 @@ def test_a_box_has_the_inertia_of_the_textbook(segments):
 
 
 def test_a_far_and_turned_mesh_has_the_same_moments():
-    """About the center nothing but axes changes: rounding grows with the distance alone."""
+    """About the center only the axes change; rounding grows only with the distance."""
     vertices, faces = shapes.capsule(0.2, 0.5)
     volume, center, inertia = mass_properties(vertices, faces)
     far = np.array([100.0, -200.0, 300.0])

@@ -34,7 +34,7 @@ def compare(robot, seed=0, batch=3):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_its_frames_are_those_of_the_robot(tmp_path, seed):
-    """Mimicking joints, links before their parents, and continuous joints among them."""
+    """The robots include mimicking and continuous joints, and links before their parents."""
     path = save(tmp_path, random_robot(np.random.default_rng(seed)))
     compare(dc.Robot.load(path, actuation="position"), seed)
 
@@ -114,7 +114,7 @@ def inertials_of(robot):
 
 
 def test_a_robot_of_its_own_chain_is_the_same(tmp_path):
-    """But for the order of its links: the same steps, with what a chain drops given."""
+    """Up to the order of links, steps are equal if the data that a chain drops is given."""
     arm = dc.Robot.load(save(tmp_path, branch(np.random.default_rng(1))), actuation="torque")
     again = dc.Robot.from_chain(
         arm.chain, surfaces={}, inertials=inertials_of(arm), actuation="torque"

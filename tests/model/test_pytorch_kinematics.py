@@ -1,6 +1,6 @@
-"""What pytorch-kinematics does not do, next to what `Robot` makes of it.
+"""Limitations of pytorch-kinematics, and the corresponding behavior of `Robot`.
 
-Each test shows the gap first, so that one that a new version has closed is seen.
+Each test shows the limitation first, and therefore fails if a new version removes it.
 """
 
 import numpy as np

@@ -288,7 +288,7 @@ class TestOutline:
 
     @pytest.mark.parametrize("phase", [0.0, 0.4, 1.7, 3.0, 5.0])
     def test_a_turned_outline_is_turned_back(self, phase):
-        """Among the three turns that agree with the largest wave, the others tell the right one."""
+        """Three rotations fit the largest wave; the other waves determine the right rotation."""
         sizes = {1: 0.002, 3: 0.01, 4: 0.004}
         cloth, state, _ = self.wavy(0.0, sizes)
         *_, seen = self.wavy(phase, sizes)
@@ -296,7 +296,7 @@ class TestOutline:
         with noting() as notes:
             found = dc.residuals.outline([state], [seen], turned=True, **call)
         assert float(found.abs().max()) < 5e-5
-        # What was seen lies in the scene of the state, on the rim of the wheel there.
+        # The placed observation is in the scene of the state, on the rim of its wheel.
         rim = dc.residuals.outline([state], notes[0].placed, **call)
         assert float(rim.abs().max()) < 5e-4
         plain = dc.residuals.outline([state], notes[0].observed, **call)

@@ -1,4 +1,4 @@
-"""The barrier's stiffness: that of a pair of surfaces by default follows from these two alone."""
+"""Barrier stiffness: the default of a pair of surfaces depends only on these two surfaces."""
 
 import warnings
 
@@ -66,7 +66,7 @@ SCENES = {
 
 
 def may_touch(a, b):
-    """Whether two surfaces of these scenes do; the base of the hand stands still."""
+    """Return whether two surfaces of these scenes may touch; the base of the hand is fixed."""
     still = ("floor", "hand/palm")
     if a.startswith("cloth") or b.startswith("cloth"):
         return True
@@ -81,7 +81,7 @@ def test_a_body_far_away_changes_no_default(name, mass):
     alone = pairs(simulator(cloths, bodies, robots, **options))
     far = box(mass, 30.0, 0.0, 1.0, side=0.4, name="far")
     joined = pairs(simulator(cloths, [*bodies, far], robots, **options))
-    # Beside a cloth nothing changes at all; else what never touches has another's number.
+    # With a cloth no default changes; otherwise pairs that never touch have another pair's value.
     compared = {pair: value for pair, value in alone.items() if cloths or may_touch(*pair)}
     assert compared
     assert {pair: joined[pair] for pair in compared} == compared
@@ -89,7 +89,7 @@ def test_a_body_far_away_changes_no_default(name, mass):
 
 
 def test_the_default_of_one_cloth_is_one_number_as_before():
-    """To the last digit that rounding leaves; the share of bending is 1e-6 of it."""
+    """The value is equal up to rounding; bending contributes a share of 1e-6."""
     sim = simulator([sheet(8, density=0.2, stretch=700.0, bending=2e-5)], [FLOOR])
     stiffness = sim.parameters().barrier_stiffness
     assert stiffness.shape == ()
@@ -102,7 +102,7 @@ def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
     found = pairs(simulator([soft, stiff], [FLOOR, light, heavy]))
     for own, other in (("cloth0", "floor"), ("cloth0", "light"), ("heavy", "floor")):
         assert found[own, other] == found[other, own]
-    # Each with the floor is what it needs itself.
+    # The pair with the floor has the surface's own requirement.
     needs = {name: found[name, "floor"] for name in ("cloth0", "cloth1", "light", "heavy")}
     assert needs["light"] < needs["cloth0"] < needs["cloth1"] < needs["heavy"]
     assert needs["heavy"] == pytest.approx(400 * needs["light"], rel=1e-12)
@@ -142,14 +142,14 @@ def test_a_body_far_away_does_not_change_how_a_cloth_lands():
     alone = rolled(simulator(*near), 25)
     far = box(95.0, 30.0, 0.0, 1.0)
     joined = rolled(simulator(near[0], [*near[1], far]), 25)
-    # One solve moves both, to a tolerance of 1e-6 m/s.
+    # One solve moves both bodies, to a tolerance of 1e-6 m/s.
     for a, b in zip(alone, joined, strict=True):
         assert (a.positions - b.positions).abs().max() < 1e-8
     assert alone[-1].report.contact_count > 50
 
 
 def test_a_heavy_box_lands_beside_a_cloth():
-    """It rests at half the barrier distance, and the cloth where it does without the box."""
+    """The box rests at half the barrier distance; the cloth rests as without the box."""
     cloth = sheet(9, 0.004)
     alone = rolled(simulator([cloth], [FLOOR]), 60)[-1]
     sim = simulator([cloth], [FLOOR, box(100.0, 0.5, 0.0, 0.2, name="box")])
@@ -186,7 +186,7 @@ def at_half_gap(xi, reach):
 
 @pytest.mark.parametrize(("mass", "of"), [(1e-3, "cloth0"), (50.0, "ball")])
 def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
-    """Beside thickness of its own: a cloth needs a curvature at half the gap, a body a slope."""
+    """With additional thickness: a cloth needs a curvature at half the gap, a body a slope."""
     reach, radius, thicknesses = 3e-3, 0.04, {"cloth0": 2e-3, "ball": 7e-3}
     ball = dc.RigidBody.sphere(
         radius,
@@ -203,14 +203,14 @@ def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
     with_radius, without = (at_half_gap(xi + r, reach)[kind] for r in (radius, 0.0))
     if of == "cloth0":
         need = found["cloth0", "cloth0"] * without
-    else:  # its weight, on a sixth of its area of which a vertex counts a quarter
+    else:  # the weight on a sixth of the area, of which a vertex counts a quarter
         area = 4 * np.pi * radius**2
         need = mass * G / (0.25 * area / 6)
     assert abs(found["cloth0", "ball"] * with_radius) == pytest.approx(need, rel=1e-9)
 
 
 def test_without_gravity_a_body_needs_what_stops_it_within_a_step():
-    """As much as with a gravity that falls through the barrier distance, from rest, in a step."""
+    """Equal to the need at a gravity that falls through the barrier distance in one step."""
     reach = 4e-3
     found = []
     for g in (0.0, reach / DT**2):
@@ -254,7 +254,7 @@ def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thic
 
 
 def test_a_joint_needs_what_the_mass_at_its_farthest_point_needs(tmp_path):
-    """An arm twice as large and no heavier has the same mass there, on four times the area."""
+    """An arm of twice the size and equal mass has equal mass there, on four times the area."""
     found = []
     for size in (1.0, 2.0):
         path = tmp_path / "arm.urdf"
@@ -288,7 +288,7 @@ def test_boxes_of_different_mass_stand_on_each_other(masses):
 
 @pytest.mark.parametrize("mass", [0.5, 10.0, 100.0])
 def test_a_cloth_lies_between_a_floor_and_a_box(mass):
-    """The floor and the cloth do not know what lies on it: the gap shrinks, and holds."""
+    """The stiffness of floor and cloth ignores the box's load: the gap shrinks but stays open."""
     sim = simulator([sheet(9, 0.01)], [FLOOR, box(mass, 0, 0, 0.08, name="box")])
     state = rolled(sim, 80)[-1]
     assert state.positions[:, 2].min() > 0.01 * sim.parameters().barrier_distance
@@ -324,7 +324,7 @@ def test_a_start_is_deep_by_the_stiffness_of_its_own_pair():
 
 
 def several(scheme="coupled", coupling="monolithic", **options):
-    """Two sheets on a floor, and a box on them where the scheme takes one."""
+    """Two sheets on a floor, and a box on the sheets unless the scheme is `split`."""
     bodies = [FLOOR] if scheme == "split" else [FLOOR, box(0.4, 0.03, 0.02, 0.086, name="box")]
     cloths = [sheet(6, 0.01, friction=0.3), sheet(5, 0.022, stretch=300.0)]
     dt = 0.002 if coupling == "cloth_to_rigid" else DT
@@ -437,6 +437,6 @@ def test_defaults_do_not_know_the_unit_of_length(unit):
             dc.Scene([grid], bodies, gravity=gravity), DT, solver=solver, contact=contact
         )
 
-    # Of N/m^2, of which N has one length: 1/length.
+    # The unit is N/m^2, and N contains one length: the stiffness scales with 1/length.
     expected, found = scene(1.0).parameters(), scene(unit).parameters()
     assert torch.equal(found.barrier_stiffness * unit, expected.barrier_stiffness)

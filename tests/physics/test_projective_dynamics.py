@@ -47,7 +47,7 @@ def simulator(cloths, elastic, bodies=(), **solver):
 
 
 def shaken(sim):
-    """A state whose velocities stretch and bend, and a control that moves what is held."""
+    """A state with velocities that stretch and bend, and a control that moves the pins."""
     g = torch.Generator().manual_seed(0)
     state = sim.initial_state()
     noise = torch.randn(state.velocities.shape, generator=g, dtype=F64)
@@ -105,7 +105,7 @@ def test_it_has_the_contact_and_the_gradient_of_newton():
 
 
 def test_parameters_and_history_leave_no_trace():
-    """The same bits alone and in a batch, and after other parameters have made other matrices."""
+    """Equal bits alone, in a batch, and after steps with other parameters and matrices."""
     sim = simulator(SCENES["patch"](), "projective")
     state, control = shaken(sim)
     once = sim.step(state, control).positions
@@ -150,7 +150,7 @@ def test_forces_beyond_what_float64_resolves_are_reported(force):
 
 
 def test_a_saddle_stops_it_and_has_no_gradient():
-    """It does not look at curvature: what is flat in its plane stays flat, and backward says so."""
+    """The iterations ignore curvature: a planar sheet stays planar, and backward reports it."""
     stiff = dc.Material(stretch=1e4)
     upright = dc.Cloth.grid(
         10,
@@ -161,7 +161,7 @@ def test_a_saddle_stops_it_and_has_no_gradient():
         pins={"a": [0, 9]},
     )
     scene = dc.Scene([upright])
-    # The contact stage of the other metrics, which has nothing to do here, leaves it there.
+    # The contact stage of the other metrics, here without contact, keeps the saddle.
     solver = dc.SolverOptions(elastic="projective", metric="elastic")
     sim = dc.Simulator(scene, 0.05, scheme="split", solver=solver)
     state = sim.initial_state()

@@ -23,7 +23,7 @@ def nearest(kind, point):
 def test_the_nearest_point_is_that_of_a_search(kind):
     charts, inside = SOLIDS[kind][1]
     rng = np.random.default_rng(0)
-    # Few of those around a solid are inside, where its sides differ in other signs.
+    # Few random points are inside the solid; the sample must include both signs of each axis.
     within = [y for y in rng.uniform(-0.6, 0.6, (400, 3)) if inside(y)][:15]
     assert (np.sign(within).min(0) < 0).all()
     assert len(within) == 15

@@ -1,4 +1,4 @@
-"""A scheme without contact, the example of docs/extending.md, where it has been applied."""
+"""A scheme without contact, the example of docs/extending.md; runs in the extended copy."""
 
 import torch
 from differences import difference

@@ -1,4 +1,4 @@
-"""Robots with lead screws, the example of docs/extending.md, where it has been applied."""
+"""Robots with lead screws, the example of docs/extending.md; runs in the extended copy."""
 
 import math
 from functools import cache
@@ -194,7 +194,7 @@ def test_gradients_of_steps_in_contact(folder, actuation, name):
 
 
 def test_an_equilibrium_carries_the_weight(folder):
-    """The drives of an arm at rest have the efforts that Pinocchio has for it."""
+    """The drives of an arm at rest have the efforts that Pinocchio computes."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
     robot = load(folder, actuation="pd", stiffness=2.0)
     sim = dc.Simulator(dc.Scene([], robots=[robot]), 0.01)

@@ -1,4 +1,4 @@
-"""Contacts one by one: they add up to the forces of the state, and lie where surfaces touch."""
+"""Single contacts add up to the forces of the state, and lie at the contacts of surfaces."""
 
 from dataclasses import fields
 
@@ -150,8 +150,8 @@ def test_a_sheet_that_slides_on_a_floor_obeys_coulomb_and_bears_its_weight(frict
     assert on_floor.points[:, 1, 2].abs().max() < 1e-12
     drag = on_floor.tangential_forces.sum(dim=0)
     assert float(drag[0]) == pytest.approx(friction * weight, rel=0.05)
-    # The moment of what acts at the points is that of what acts at the vertices, but for the couple
-    # that lets friction across a gap keep angular momentum.
+    # The moments of forces at points and at vertices agree, up to the couple by which friction
+    # across a gap conserves angular momentum.
     wrench = sim.contact_wrenches(state)["floor"]
     moment = torch.linalg.cross(on_floor.points[:, 1], on_floor.forces).sum(dim=0)
     couple = float(on_floor.gaps.max() * drag.norm())

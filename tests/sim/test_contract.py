@@ -1,6 +1,6 @@
 """The public contract of a simulator: names, checks, hold, batches, purity, autograd, saving.
 
-Nothing here depends on how accurate a step is; the physics and its gradients have their own tests.
+No test here depends on the accuracy of a step; other tests cover the physics and its gradients.
 """
 
 import copy
@@ -87,9 +87,9 @@ PUBLIC = {
 
 
 def make_scene():
-    """Two cloths above a floor that they do not reach in a few steps, and a box far away.
+    """Two cloths above a floor, which they do not reach in a few steps, and a distant box.
 
-    Coordinates are in general position, so that no gradient vanishes by symmetry.
+    Coordinates are in general position: no gradient vanishes by symmetry.
     """
     sheet = dc.Cloth.grid(
         4,
@@ -153,7 +153,7 @@ def test_build_info_is_a_dict():
     assert isinstance(dc.build_info(), dict)
 
 
-# --- What a simulator offers ---------------------------------------------------------------------
+# --- Attributes of a simulator -------------------------------------------------------------------
 
 
 def test_initial_state_has_the_shapes_of_the_scene(sim):
@@ -754,7 +754,7 @@ def test_steps_with_backward_do_not_grow(sim):
 
 @pytest.mark.parametrize("function", [torch.sum, lambda x: (x**2).sum()], ids=["sum", "square"])
 def test_second_derivatives_are_refused(sim, function):
-    """Also where the cotangent has no graph, as for a sum."""
+    """This includes cotangents without a graph, as of a sum."""
     state = moved(sim)
     x = state.positions.clone().requires_grad_()
     total = function(sim.step(state.replace(positions=x)).positions)
@@ -900,7 +900,7 @@ def test_checkpoints_change_no_bit(sim, every, callable_controls):
 
 
 def test_arrays_may_be_used_again_behind_a_checkpoint(sim):
-    """A rollout copies what is no tensor: its steps are repeated as they were."""
+    """A rollout copies inputs that are no tensors: its steps are repeated unchanged."""
     gradients = []
     for edited in (False, True):
         x = moved(sim).positions.requires_grad_()

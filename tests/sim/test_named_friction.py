@@ -94,7 +94,7 @@ def test_it_prints_and_pickles(sim):
     assert copy.friction == {("mat", "floor"): 0.25}
 
 
-# The box is light, and the warning about it is not what this is about.
+# The box is light; this test does not need the warning about its added mass.
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 def test_couplings_take_it():
     mat = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 0.001, 1, 0, 0, 0], name="mat")

@@ -1,4 +1,4 @@
-"""The step of second order: momentum, order, drag, rest, bits, and what is refused."""
+"""The step of second order: momentum, order, drag, rest, bits and refused options."""
 
 from dataclasses import replace
 
@@ -96,7 +96,7 @@ def test_what_rests_stays_as_by_euler():
     rest = case.state.replace(velocities=torch.zeros_like(case.state.velocities))
     second = scenes.regime("sticking", integrator=SECOND)
     still = case.where(state=rest), second.where(state=rest)
-    # Drag is that of another mean velocity.
+    # Without air, because drag depends on the integrator's mean velocity.
     parameters = {"air_density": torch.zeros((), dtype=F64)}
     ends = [replace(c, parameters=parameters).step().positions for c in still]
     torch.testing.assert_close(*ends, rtol=0, atol=1e-9)

@@ -23,9 +23,9 @@ def simulator(scheme="coupled", elastic="newton", **options):
 
 
 def pushed_batch():
-    """Three environments; the pins of the second go through the plane, and the third is torn.
+    """Three environments: the second's pins move through the plane, the third is torn apart.
 
-    The second is stuck after 40 iterations; the third does not converge in 500 either.
+    The second is blocked after 40 iterations; the third does not converge in 500 either.
     """
     sim = simulator(max_iterations=60)
     start = sim.initial_state(batch_size=3)

@@ -1,4 +1,4 @@
-"""Scenes in which single precision does not do: factors in doubles take its place, unasked."""
+"""Scenes beyond single precision: the solver falls back to factors in double precision."""
 
 import pytest
 import torch
@@ -33,7 +33,7 @@ def strip(load):
 
 
 def net(n, *, stretch):
-    """A sheet in no plane of the coordinates, stiff against all but what its mass resists."""
+    """A sheet in general orientation, stiff in its plane and with little inertia."""
     pose = [0, 0, 0, 0.9, 0.3, 0.1, 0.3]
     cloth = dc.Cloth.grid(
         n, n, pose=pose, material=dc.Material(stretch=stretch), pins={"corners": [0, n - 1]}
@@ -108,10 +108,10 @@ def test_factors_that_are_made_again_are_the_same(name):
 
 @pytest.mark.parametrize(("load", "is_flat"), [(9.0, True), (9.108, False)])
 def test_a_flat_strip_past_its_critical_load_leaves_its_plane(load, is_flat):
-    """By symmetry nothing pushes it out, and what holds it there is lost in single precision.
+    """By symmetry no force points out of the plane; single precision loses its stiffness.
 
-    Between 9.098 and 9.0995 m/s^2 a factorization of the Hessian in doubles turns. Where the strip
-    ends is far away, with many iterations on the way.
+    Between 9.098 and 9.0995 m/s^2 a factorization of the Hessian in doubles becomes indefinite.
+    The buckled minimum is far away, many iterations later.
     """
     simulator = strip(load)
     after = step(simulator, simulator.initial_state().velocities)
