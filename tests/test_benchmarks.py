@@ -130,7 +130,7 @@ def test_every_factorization_is_timed():
 
 
 @pytest.mark.slow
-def test_what_moves_by_forces_is_timed_beside_what_is_given():
+def test_dynamic_bodies_are_timed_beside_prescribed_ones():
     command = [sys.executable, "-m", "benchmarks.coupling", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr

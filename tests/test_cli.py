@@ -98,7 +98,7 @@ def test_saved_states_are_exported(call, tmp_path):
     assert call("export", "states.pt", "states.npz", "--overwrite").exit_code == 0
 
 
-def test_one_environment_of_a_batch_is_exported(call):
+def test_a_single_environment_of_a_batch_is_exported(call):
     simulator = Simulator(dc.Scene([dc.Cloth.grid(2, 2, name="sheet")]), 0.01)
     states = simulator.rollout(simulator.initial_state(2), steps=2)
     states.save("batch.pt")
@@ -224,7 +224,7 @@ def test_the_module_runs():
         pytest.param(["run", "x.yaml", "--sett", "y"], 2, id="misspelled"),
     ],
 )
-def test_what_needs_no_simulation_reads_no_torch(arguments, code):
+def test_commands_without_simulation_import_no_torch(arguments, code):
     """Importing torch needs seconds."""
     script = (
         "import sys\n"
@@ -367,7 +367,7 @@ def test_a_finished_optimization_takes_more_iterations(call, tmp_path):
         ),
     ],
 )
-def test_what_cannot_be_resumed(call, tmp_path, arguments, message):
+def test_a_bad_resumption_is_refused(call, tmp_path, arguments, message):
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/resume.pt").write_bytes(b"no such thing")
     (tmp_path / "good").mkdir()
@@ -446,7 +446,7 @@ with locked("hold", Path(sys.argv[1])):
 
 
 @pytest.mark.parametrize("name", ["resume.pt", "metrics.json", "actions.npz", "events"])
-def test_something_in_the_place_of_results_is_refused(call, tmp_path, name):
+def test_an_obstacle_in_the_place_of_results_is_refused(call, tmp_path, name):
     (tmp_path / "out").mkdir()
     if name == "events":
         (tmp_path / "out/events").touch()
@@ -611,7 +611,7 @@ def test_a_file_named_like_a_folder_of_results_is_refused_before_the_work(call, 
 
 
 @pytest.mark.parametrize("name", ["actions.pt", "loss.png", "metrics.json"])
-def test_a_folder_in_what_is_resumed_is_refused_before_the_work(call, tmp_path, name, monkeypatch):
+def test_a_folder_in_resumed_results_is_refused_before_the_work(call, tmp_path, name, monkeypatch):
     arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--set=optimizer.iterations=1"]
     assert call("optimize", *arguments, "--out", "out").exit_code == 0
     (tmp_path / "out" / name).unlink()

@@ -236,7 +236,7 @@ def test_every_block_of_python_runs_alone(page, line, code):
     exec(compile("\n" * line + code, str(page), "exec"), {"__name__": "__main__"})
 
 
-def test_one_sheet_takes_one_amount_of_memory():
+def test_pages_agree_on_the_memory_of_the_hanging_sheet():
     """All pages state one amount for the sheet of a slow test in tests/solver."""
     told = []
     for page in PAGES:

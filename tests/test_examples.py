@@ -190,7 +190,7 @@ def plan_grasp():
     return ROOT / "examples/plan_grasp.py"
 
 
-def test_gradients_flow_through_a_plan_and_what_it_does(plan_grasp):
+def test_gradients_flow_through_a_plan_and_its_motion(plan_grasp):
     names = runpy.run_path(str(plan_grasp))
     way = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64, requires_grad=True)
     states = names["carry_out"]({"way": way})

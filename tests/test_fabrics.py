@@ -14,7 +14,7 @@ from diffcloth_torch.model.orthotropy import check_bending
 NAMES = list(dc.fabrics.MEASUREMENTS)
 
 
-def test_there_are_eight_and_configurations_know_them():
+def test_configurations_know_all_eight_fabrics():
     assert len(NAMES) == 8
     assert list(get_args(Fabric)) == NAMES
 
@@ -48,7 +48,7 @@ def test_a_quarter_is_the_stiffness_of_a_plate_of_hinges_on_equilateral_triangle
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_is_a_woven_cloth_that_moves(name):
+def test_every_fabric_is_a_woven_cloth_that_moves(name):
     material = dc.fabrics.material(name, thickness=1e-4)
     assert material.is_orthotropic
     assert material.thickness == 1e-4
@@ -65,7 +65,7 @@ def test_each_is_a_woven_cloth_that_moves(name):
     assert state.positions[-1, 2] < -1e-3
 
 
-def test_an_unknown_one_is_refused():
+def test_an_unknown_fabric_is_refused():
     with pytest.raises(dc.InvalidInput, match=r"fabrics.material: `name` must be .*denim"):
         dc.fabrics.material("tweed")
     with pytest.raises(dc.InvalidInput, match="`fabric` must be "):

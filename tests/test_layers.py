@@ -136,7 +136,7 @@ def test_modules_import_only_the_core_from_the_package_itself():
 PRIVATE = re.compile(r"(?<!diffcloth_)\b(torch|forward_ad)(\.\w+)*\._[a-zA-Z]")
 
 
-def test_one_module_uses_undocumented_torch():
+def test_a_single_module_uses_undocumented_torch():
     package = ROOT / "diffcloth_torch"
     users = {p.relative_to(package) for p in package.rglob("*.py") if PRIVATE.search(p.read_text())}
     assert users == {Path("autograd/torch_private.py")}

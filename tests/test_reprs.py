@@ -76,7 +76,7 @@ def test_a_control_says_what_is_set(simulator):
 
 
 @pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
-def test_what_is_no_tensor_or_not_on_the_cpu_is_said_too(state):
+def test_reprs_show_fields_that_are_no_cpu_tensors(state):
     """Nothing checks the fields of a record before a step does."""
     nested = torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)])
     for value, text in (
@@ -116,7 +116,7 @@ def test_a_report_of_a_batch_says_what_its_numbers_range_over(simulator):
     assert lines(mixed).endswith("counts={})")
 
 
-def test_what_a_scene_is_made_of(simulator):
+def test_a_scene_shows_its_parts(simulator):
     cloth, hand = simulator.scene.cloths[0], simulator.scene.robots[0]
     ball, floor = simulator.scene.bodies
     assert repr(cloth) == "Cloth('sheet', 576 vertices, 1058 faces)"

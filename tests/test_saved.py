@@ -97,7 +97,7 @@ def test_a_class_outside_of_the_table_is_refused():
 
 
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-def test_each_protocol_loads(protocol):
+def test_every_protocol_loads(protocol):
     whole = load_pickle()
     again = pickle.loads(pickle.dumps(whole, protocol=protocol))
     assert {name: type(value) for name, value in again.items()} == {
@@ -108,7 +108,7 @@ def test_each_protocol_loads(protocol):
 _IMPORT = r"from diffcloth_torch\.([\w.]+) import ([^()]+?|\([^)]*\))\n"
 
 
-def test_names_are_found_where_they_are_said_to_be():
+def test_names_are_found_in_the_listed_modules():
     """The table of homes, the imports that type checkers see and the public names agree."""
     source = Path(dc.__file__).read_text()
     block = source[source.index("if TYPE_CHECKING") : source.index("__all__ = ")]

@@ -22,7 +22,7 @@ def names(text):
     return toctree.split()
 
 
-def test_all_of_them_are_listed():
+def test_all_tutorials_are_listed():
     assert len(TUTORIALS) == 7
     index = (DOCS / "tutorials/index.md").read_text()
     assert sorted(names(index)) == [page.stem for page in TUTORIALS]

@@ -244,7 +244,7 @@ def test_tangents_are_the_transpose_of_gradients(case, name):
 
 
 @pytest.mark.parametrize("what", ["body", "joint", "mimic", "both"])
-def test_what_is_prescribed_turns_along_its_arc(what):
+def test_prescribed_bodies_and_joints_turn_along_their_arcs(what):
     """A third of a turn per step, far from the cloth: points do not follow chords of the arc."""
     angle = 2.0
     if what == "body":

@@ -178,7 +178,7 @@ def test_a_light_body_warns_once(coupling):
 
 @STAGGERED
 @pytest.mark.parametrize("source", ["wind", "forces", "body_wrenches", "body_poses"])
-def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, source):
+def test_externally_driven_motion_is_no_gain_of_the_coupling(coupling, source):
     """A sheet and the bodies under it are pressed together, without a warning."""
     airy = dc.Material(stretch=200.0, density=0.2, normal_drag=1.0)
     sheet = dc.Cloth.grid(5, 5, 0.3, material=airy, pose=[0, 0, 0.055, 1, 0, 0, 0])
@@ -208,7 +208,7 @@ def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, sou
 
 
 @STAGGERED
-def test_what_a_floor_gives_back_is_no_gain_of_the_coupling(coupling):
+def test_the_rebound_from_a_floor_is_no_gain_of_the_coupling(coupling):
     """A box bounces on a floor, with a sheet on it."""
     sheet = dc.Cloth.grid(5, 5, 0.3, pose=[0, 0, 0.1085, 1, 0, 0, 0])
     bodies = [
@@ -264,7 +264,7 @@ def test_a_light_link_is_warned_of_by_its_name(coupling, tmp_path):
 
 
 @pytest.mark.parametrize(("way", "speed"), [(-0.004, 0.0), (0.006, 3.0)])
-def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
+def test_cloth_to_rigid_moves_prescribed_bodies_with_the_cloth(way, speed):
     """Only bodies that forces move are frozen in the cloth solve; a kinematic body is not."""
     sheet = trampoline("monolithic")[0].scene.cloths
     mover = dc.RigidBody.box(0.1, motion="kinematic", pose=[0.013, 0.021, 0.052, 1, 0, 0, 0])
@@ -430,7 +430,7 @@ def test_no_body_crosses_another_on_the_way(coupling, kinematic):
 
 
 @STAGGERED
-def test_nothing_intersects_and_the_path_leads_there(coupling):
+def test_nothing_intersects_and_the_path_leads_to_the_end(coupling):
     sim, state = trampoline(coupling)
     for _ in range(20):
         path = sim.path(state)
@@ -493,7 +493,7 @@ def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_pat
 
 
 @STAGGERED
-def test_what_is_prescribed_passes_through_what_is_prescribed(coupling):
+def test_prescribed_surfaces_pass_through_each_other(coupling):
     """A kinematic hand passes through a wall, beside a falling sheet and a falling box."""
     hand = dc.Robot.load(GRIPPER, base="kinematic", actuation="position", name="hand")
     sheet = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 2, 1, 0, 0, 0])

@@ -210,7 +210,7 @@ def contact_wrenches(sim, state):
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
-def test_contact_is_held_too(coupling):
+def test_efforts_balance_contact(coupling):
     """A gripper on a moving base, one finger of which is prescribed, presses on cloth and box."""
     sim, state = coupled_scenes.in_contact(coupling, "kinematic")
     given = coupled_scenes.controls(sim, coupled_scenes.control(sim), 2, start=3)
@@ -237,7 +237,7 @@ def test_contact_is_held_too(coupling):
 @pytest.mark.parametrize(
     "name", ["ur5_robot.urdf", "allegro_left_hand.urdf", "talos_left_arm.urdf"]
 )
-def test_a_public_robot_holds_what_lies_on_it(name):
+def test_a_public_robot_holds_a_sheet(name):
     """The sheet still falls and the robot is at rest: efforts from weight and contact only."""
     path = robot_file("example-robot-data", name)
     robot, _ = inside_its_limits(path, actuation="position")

@@ -29,7 +29,7 @@ def oracle(w):
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_it_and_its_derivatives_are_those_of_matrix_exponentials(turn):
+def test_the_exponential_and_its_derivatives_match_matrix_exponentials(turn):
     for axis in np.random.default_rng(0).normal(size=(4, 3)):
         w = turn * axis / np.linalg.norm(axis)
         # Rounding: the oracle's own error is 1e-14 for large rotations.

@@ -137,7 +137,7 @@ def test_a_batch_takes_shared_and_own_values(layout, scene):
 
 
 @pytest.mark.parametrize("actuation", ["position", "velocity", "torque"])
-def test_a_gradient_by_what_moves_no_joint_is_refused(actuation):
+def test_a_gradient_by_values_that_move_no_joint_is_refused(actuation):
     robot = dc.Robot.load(dc.robots.GRIPPER, actuation=actuation)
     cloth = dc.Cloth.grid(2, 2, size=0.1, pose=[1, 0, 0, 1, 0, 0, 0])
     layout = Layout(assemble(dc.Scene([cloth], robots=[robot])))
@@ -380,7 +380,7 @@ def test_a_link_that_is_given_mass_needs_an_inertia_that_is_not_negative(tmp_pat
             simulator.step(simulator.initial_state(), None, changed)
 
 
-def test_rows_of_what_forces_do_not_move_are_free(layout, defaults):
+def test_rows_of_bodies_that_no_force_moves_are_free(layout, defaults):
     given = dc.Parameters(
         body_mass=with_row(defaults["body_mass"], 0, 7.0),
         body_inertia=with_row(defaults["body_inertia"], 1, -1.0),

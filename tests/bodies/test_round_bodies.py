@@ -60,7 +60,7 @@ ROLLING = {
 
 
 @pytest.mark.parametrize("name", ROLLING)
-def test_it_rolls_down_an_incline_as_round_bodies_do(name):
+def test_a_smooth_body_rolls_down_an_incline_as_round_bodies_do(name):
     """Acceleration g sin / (1 + I / (m r^2)), up to the order of h, and spin v / r.
 
     r counts from the surface of the incline, which is half the barrier distance away.
@@ -110,7 +110,7 @@ def test_a_cylinder_of_many_sides_rolls_nearly_as_a_round_one(rings, least, most
     assert least < speed / (seconds * G * math.sin(angle) / 1.5) - 1 < most
 
 
-def test_it_rolls_on_another_round_body():
+def test_a_smooth_ball_rolls_on_another_round_body():
     """A ball rolls down from the top of a fixed ball, according to its gap share and energy."""
     large = dc.RigidBody.sphere(0.4, smooth=True, friction=0.8)
     start = 0.3
@@ -403,7 +403,7 @@ def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
 
 
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
-def test_it_carries_the_weight_of_the_cloth(kind):
+def test_a_smooth_body_carries_the_weight_of_the_cloth(kind):
     """At rest, friction holds the sheet in place and the body carries its weight."""
     body, _ = below(kind, smooth=True, friction=2.0)
     sim, states = drape(body, n=10, solver=dc.SolverOptions(tolerance=1e-7))
@@ -431,7 +431,7 @@ def raised(body, seconds=0.4, height=0.06, n=10):
     return sim, state
 
 
-def test_a_fine_mesh_comes_closer_to_it():
+def test_finer_meshes_converge_to_the_smooth_body():
     """Rest positions of a taut sheet on a smooth sphere, against meshes of the sphere."""
     ends = []
     for keywords in ({"smooth": True}, *({"subdivisions": k} for k in (1, 2, 4))):
@@ -511,7 +511,7 @@ def test_the_gap_under_a_pressure_does_not_know_the_mesh_of_the_cloth(jitter):
     assert np.ptp(gaps) < (0.04 if jitter else 1e-3) * np.mean(gaps)
 
 
-def test_what_a_sheet_does_does_not_know_how_a_sphere_is_turned():
+def test_the_orientation_of_a_sphere_does_not_change_a_sheet():
     """The facets of a mesh do have an effect."""
     spreads = []
     for keywords in ({"smooth": True}, {"subdivisions": 1}):
@@ -616,7 +616,7 @@ def test_bits_do_not_depend_on_threads_or_batches(in_contact, threads):
 
 @pytest.mark.parametrize("height", [-0.15, 0.01], ids=["within", "across"])
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
-def test_what_overlaps_at_the_start_is_named(kind, height):
+def test_smooth_bodies_that_overlap_at_the_start_are_named(kind, height):
     keywords = {"smooth": True, "pose": [0.03, 0.01, height, 1, 0, 0, 0], "name": "it"}
     if kind == "sphere":
         body = dc.RigidBody.sphere(0.2, **keywords)
@@ -628,7 +628,7 @@ def test_what_overlaps_at_the_start_is_named(kind, height):
 
 
 @pytest.mark.parametrize("apart", [0.25, 0.35])
-def test_two_of_them_overlap_by_what_their_radii_say(apart):
+def test_smooth_bodies_overlap_according_to_their_radii(apart):
     balls = [
         dc.RigidBody.sphere(
             radius, smooth=True, motion="dynamic", mass=0.3, pose=[x, 0, 0, 1, 0, 0, 0]
@@ -643,7 +643,7 @@ def test_two_of_them_overlap_by_what_their_radii_say(apart):
         dc.Simulator(dc.Scene([], balls), 0.01, contact=options)
 
 
-def test_something_can_be_attached_to_it():
+def test_an_attachment_to_a_smooth_body_holds():
     """The attachment point is fixed in the body's frame and rotates with the body."""
     ball = dc.RigidBody.sphere(
         0.1, smooth=True, motion="dynamic", mass=0.3, pose=[0, 0, -0.3, 1, 0, 0, 0], name="ball"
@@ -668,7 +668,7 @@ def test_something_can_be_attached_to_it():
 
 @pytest.mark.parametrize("coupling", ["monolithic", "rigid_to_cloth", "cloth_to_rigid"])
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
-def test_couplings_agree_on_it(coupling):
+def test_couplings_agree_on_smooth_bodies(coupling):
     """A heavy ball falls onto a sheet over a capsule: every coupling supports the ball."""
     ball = dc.RigidBody.sphere(
         0.06, smooth=True, motion="dynamic", density=3000.0, pose=[0.02, 0.01, 0.08, 1, 0, 0, 0]
@@ -683,7 +683,7 @@ def test_couplings_agree_on_it(coupling):
     assert state.body_forces.shape == (8, 3)
 
 
-def test_it_is_drawn_and_exported_as_its_mesh(tmp_path):
+def test_a_smooth_body_is_drawn_and_exported_as_its_mesh(tmp_path):
     ball = dc.RigidBody.sphere(0.1, subdivisions=1, smooth=True, pose=[0, 0, -0.11, 1, 0, 0, 0])
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(6, 6, size=0.3)], [ball]), 0.01)
     state = sim.rollout(sim.initial_state(), steps=20)[-1]
@@ -698,7 +698,7 @@ def test_it_is_drawn_and_exported_as_its_mesh(tmp_path):
     assert repr(kept) == "RigidBody(static, 80 faces, smooth)"
 
 
-def test_what_cannot_be_smooth_is_refused():
+def test_bodies_that_cannot_be_smooth_are_refused():
     with pytest.raises(dc.InvalidInput, match=r"RigidBody\.capsule can be smooth"):
         dc.RigidBody.cylinder(0.1, 0.2, smooth=True)
     with pytest.raises(dc.InvalidInput, match="`smooth` must not be set with `nodal_contact`"):
@@ -719,7 +719,7 @@ def test_split_steps_are_those_of_the_same_sum():
     torch.testing.assert_close(*(end.positions for end in ends), atol=1e-5, rtol=0)
 
 
-def test_projective_steps_touch_the_same_surface_without_it():
+def test_projective_steps_touch_the_smooth_surface_in_any_case():
     """The projective scheme's contact is nodal and always uses the analytic surface."""
     ends = []
     for smooth in (True, False):

@@ -73,7 +73,7 @@ def test_a_sphere_alone_is_the_link_and_one_beside_others_a_link_of_its_own(tmp_
     np.testing.assert_array_equal(robot.mechanism.mass, [0.4, 0.4, 0, 0])
 
 
-def test_of_several_spheres_the_first_is_the_link(tmp_path):
+def test_the_first_of_several_spheres_is_the_link(tmp_path):
     robot = finger(tmp_path, TIP + KNOB)
     assert robot.link_names == ("base", "finger", "finger/1")
     np.testing.assert_allclose(robot.skeletons["finger"].vertices[0], [0.3, 0, 0.01])
@@ -86,7 +86,7 @@ def test_names_choose_links(tmp_path):
     assert finger(tmp_path, smooth={"finger": False}).link_names == ("base", "finger")
 
 
-def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
+def test_options_of_a_link_apply_to_its_spheres(tmp_path):
     robot = finger(
         tmp_path,
         ROD + TIP + KNOB,
@@ -113,12 +113,12 @@ def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
         (ROD + TIP, "finger", TypeError, "`smooth` must be True or False, got str"),
     ],
 )
-def test_what_cannot_be_smooth_is_refused(tmp_path, shapes, smooth, error, message):
+def test_links_that_cannot_be_smooth_are_refused(tmp_path, shapes, smooth, error, message):
     with pytest.raises(error, match=message):
         finger(tmp_path, shapes, smooth=smooth)
 
 
-def test_it_pickles(tmp_path):
+def test_a_robot_with_smooth_links_pickles(tmp_path):
     again = pickle.loads(pickle.dumps(finger(tmp_path)))
     np.testing.assert_array_equal(again.contact_surfaces[2].vertices[0], [0.3, 0, 0.01])
     assert again.contact_surfaces[2].radius == RADIUS
@@ -428,7 +428,7 @@ def test_a_loss_over_joint_angles_has_no_facets(tmp_path):
 # --- Other users of surfaces ----------------------------------------------------------------------
 
 
-def test_it_is_drawn_and_exported_as_its_meshes(tmp_path):
+def test_a_smooth_link_is_drawn_and_exported_as_its_meshes(tmp_path):
     robot = finger(tmp_path, actuation="position")
     sim = dc.Simulator(dc.Scene([sheet(6)], robots=[robot]), 0.01)
     control = dc.Control(joint_positions=torch.tensor([0.1], dtype=F64))
@@ -447,7 +447,7 @@ def test_it_is_drawn_and_exported_as_its_meshes(tmp_path):
     torch.testing.assert_close(again.meshes()["arm/finger/1"][0], vertices)
 
 
-def test_something_can_be_attached_to_it(tmp_path):
+def test_an_attachment_to_a_smooth_link_holds(tmp_path):
     robot = finger(tmp_path, actuation="position")
     string = dc.Attachment(
         ("cloth0", 20), ("arm/finger/1", [0.3, 0.0, -0.08]), stiffness=50.0, rest_length=0.0
@@ -460,7 +460,7 @@ def test_something_can_be_attached_to_it(tmp_path):
     assert float(force) == pytest.approx(50 * float(length), rel=1e-6)
 
 
-def test_configurations_take_it(tmp_path):
+def test_configurations_accept_smooth_links(tmp_path):
     robot = finger(tmp_path)
     assert robot.name == "arm"
     config = tmp_path / "run.yaml"

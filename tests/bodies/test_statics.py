@@ -146,7 +146,7 @@ WAYS_TO_PIN = {
 
 @pytest.mark.parametrize("pins", WAYS_TO_PIN)
 @pytest.mark.parametrize("shape", ["box", "capsule"])
-def test_pinned_cloth_bears_what_lies_on_it(shape, pins):
+def test_pinned_cloth_bears_a_body(shape, pins):
     """Some triangles have three pinned corners; the pins are also moved up."""
     sim = laid(WAYS_TO_PIN[pins], on_sheet(shape))
     state = sim.initial_state()
@@ -199,7 +199,7 @@ def test_fingers_grip_cloth_that_is_pinned_all_over():
         assert abs(force) == pytest.approx(press.item(), rel=1e-4)
 
 
-def test_gradients_of_what_lies_on_pinned_cloth_are_those_of_differences():
+def test_gradients_of_a_body_on_pinned_cloth_are_those_of_differences():
     """A loss on two steps, differentiated by the pins' targets, the body's mass and thickness."""
     sim = laid(lambda x, y: np.abs(x) < 0.25, on_sheet("box"))
     with torch.no_grad():

@@ -118,7 +118,7 @@ def test_velocities_of_bodies_on_poses_are_quotients(sim):
     torch.testing.assert_close(hand, expected)
 
 
-def test_they_are_where_nothing_but_cloths_moves_by_forces():
+def test_velocities_of_bodies_on_poses_are_quotients_without_coordinates():
     """Difference quotients and their gradients in a scene without generalized coordinates."""
     bodies = [
         dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 0, 1, 1, 0, 0, 0]),

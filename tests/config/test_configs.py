@@ -319,7 +319,7 @@ scene:
 """
 
 
-def test_what_moves_by_forces_is_built(write):
+def test_dynamic_bodies_and_robots_are_built(write):
     path = write(MOVING)
     task = load_task(path, [])
     scene = task.scene

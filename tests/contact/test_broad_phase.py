@@ -180,7 +180,7 @@ def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
 
 
 @pytest.mark.parametrize("away", [0.0, 1e6], ids=["near the origin", "far away"])
-def test_at_rest_what_is_within_reach_is_a_candidate(away):
+def test_elements_within_reach_at_rest_are_candidates(away):
     """All candidates within reach are found, and less than half of the others found by boxes."""
     x, faces, surface = scene()
     mesh = kernels.BroadPhase(faces, surface, 2, True, x)

@@ -85,7 +85,7 @@ def test_pairs_stay_as_far_apart_as_they_say(search, scale, common):
     assert checked > 20 or scale > 1e-3
 
 
-def test_what_moves_alone_brings_its_own_pairs_alone(search):
+def test_a_single_moving_vertex_adds_only_its_own_pairs(search):
     """A surface counts as near as its fastest part, but its other pairs do not."""
     x, mesh, surface, _ = search
     mover = 0
@@ -114,7 +114,7 @@ def test_no_pair_of_bodies_is_missed(scale):
     assert close_count > 100
 
 
-def test_what_meets_nothing_costs_no_list():
+def test_a_motion_without_contact_costs_no_list():
     """A motion of any length without contact needs no list; a motion through others needs one."""
     x, faces, surface = crowd()
     mesh = kernels.BroadPhase(faces, surface, 1, True, x, ignored_pairs=[[0, 3]])
@@ -129,7 +129,7 @@ def test_what_meets_nothing_costs_no_list():
     assert mesh.builds == 2
 
 
-def test_what_flies_side_by_side_brings_few_pairs():
+def test_parts_that_fly_side_by_side_add_few_pairs():
     """A curtain swings as a door does: no pair within the curtain comes closer."""
     x, faces, surface = merged([grid(12, np.random.default_rng(2))])
     mesh = kernels.BroadPhase(faces, surface, 1, True, x)
@@ -140,7 +140,7 @@ def test_what_flies_side_by_side_brings_few_pairs():
     assert len(found) < 0.2 * len(mesh.find(x, x + turn, [0.01]))
 
 
-def test_what_is_found_is_sorted(search):
+def test_candidates_are_sorted(search):
     x, mesh, _, _ = search
     step = 1e-3 * np.random.default_rng(1).normal(size=x.shape)
     kept = mesh.find_kept(x, x + step, REACH)
@@ -170,7 +170,7 @@ def test_another_reach_makes_another_list(search):
         assert close <= {tuple(c) for c in found}
 
 
-def test_what_is_near_a_point_does_not_depend_on_the_list(search):
+def test_pairs_near_a_point_do_not_depend_on_the_list(search):
     x, _, surface, everything = search
     _, faces, _ = scene()
     at = x + 0.003 * np.random.default_rng(2).normal(size=x.shape)

@@ -167,7 +167,7 @@ def test_motions_that_are_not_numbers_are_not_certified(broken):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 1e3], ids=["thin", "thick", "far"])
-def test_what_stays_beyond_the_harmless_distance_is_never_the_first(share):
+def test_a_pair_beyond_the_harmless_distance_is_never_the_first(share):
     """A pair that ends slightly nearer is the first: point and triangle, and crossing edges."""
     d_hat, xi = 1e-3, 1e-3 * min(share, 1.0)
     offset = np.array([0.3, 0.3, 0.4]) * (1.0 if share < 2 else share)

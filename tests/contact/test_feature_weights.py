@@ -312,7 +312,7 @@ def test_a_star_is_sharp_at_its_tips_only():
     assert edge[(0, 12)] > 0 == edge[(1, 12)]
 
 
-def test_pinned_faces_of_a_cloth_bear_what_moves_alone():
+def test_pinned_faces_of_a_cloth_bear_only_moving_points():
     scene = contact_scenes.make("pinned")
     _, _, counts = scene.potential().feature_weights(prescribed_point=True)
     expected = [not scene.prescribed[f].all() or scene.surface[f[0]] > 0 for f in scene.faces]

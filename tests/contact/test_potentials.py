@@ -456,7 +456,7 @@ def test_duals_remember_the_other_side_of_a_kink(name):
 @pytest.mark.parametrize("lag", ["start", "end"])
 @pytest.mark.parametrize("angle", [1e-3, 0.1, 1.0])
 @pytest.mark.parametrize("name", NAMES)
-def test_what_moves_as_one_has_no_friction(name, angle, lag):
+def test_common_rigid_motion_has_no_friction(name, angle, lag):
     """Rigid motion of all bodies and cloths, lagged at either end, for any slip velocity."""
     scene = contact_scenes.make(name)
     potential = scene.potential(slip=1e-9)

@@ -229,7 +229,7 @@ def test_fields_of_the_state_after(world):
 
 
 @pytest.mark.parametrize("speed", [1.2, 0.9])
-def test_what_turns_fast_may_not_be_touched(world, speed):
+def test_a_body_that_turns_fast_must_not_have_contact(world, speed):
     """The limit applies before and after the step; contact of other bodies does not count."""
     assembly, dynamics, parameters, state, control = world
     fast = tensor([0, 0, 0, speed / H, 0, 0]) * tensor([0, 1, 0, 0])[:, None]
@@ -253,7 +253,7 @@ def test_what_turns_fast_may_not_be_touched(world, speed):
     assert "body 'a' turns at" in far(on[0], spun)[0]
 
 
-def test_of_several_that_turn_too_far_the_first_is_told_of(world):
+def test_the_first_of_several_bodies_that_turn_too_far_is_named(world):
     """The error has its speed, the larger of before and after, and a sufficient time step.
 
     Forces that cancel also count as contact.
@@ -482,7 +482,7 @@ def test_cloth_to_rigid_lets_the_cloth_go_first(world):
     assert (result.fields["joint_velocities"] != free["joint_velocities"]).all()
 
 
-def test_the_cloth_sees_what_is_prescribed_at_its_end_and_the_rest_still():
+def test_the_cloth_meets_prescribed_joints_at_their_end_and_others_at_rest():
     """Order `cloth_to_rigid`: other coordinates move after the cloth, from their start values."""
     scene = make_scene(actuation=("position", "pd"), base="fixed")
     assembly = assemble(scene)

@@ -293,7 +293,7 @@ def test_a_floating_chain_keeps_its_momentum():
     torch.testing.assert_close(turning, angular, rtol=0, atol=1e-9)
 
 
-def test_one_link_on_a_floating_base_moves_like_a_body():
+def test_a_single_link_on_a_floating_base_moves_like_a_body():
     mechanism = make(*TREES["body"], base="floating", rng=np.random.default_rng(3))
     chain = make_chain(mechanism)
     pose, _, nu = random_configuration(mechanism, np.random.default_rng(4))
@@ -378,7 +378,7 @@ def test_efforts_of_prescribed_joints_move_a_free_chain_alike():
     assert fine < 0.6 * coarse
 
 
-def test_a_prescribed_joint_takes_what_a_drive_beside_it_does():
+def test_a_prescribed_joint_balances_the_drive_beside_it():
     rng = np.random.default_rng(8)
     mixed = make_chain(make(*TREES["chain"], rng=rng, actuation=("position", "pd", "position")))
     _, joints, _ = random_configuration(mixed.mechanism, rng)

@@ -66,7 +66,7 @@ def configuration(mechanism, rng):
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_it_is_the_second_derivative_of_the_energy(name):
+def test_the_stiffness_is_the_second_derivative_of_the_energy(name):
     kinds, parents, mimic = TREES[name]
     rng = np.random.default_rng(4)
     mechanism = make(kinds, parents, base="floating", rng=rng, mimic=mimic)
@@ -87,7 +87,7 @@ def test_it_is_the_second_derivative_of_the_energy(name):
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_the_bound_is_above_it_in_all_configurations(name):
+def test_the_bound_is_above_the_stiffness_in_all_configurations(name):
     """Sliding joints are an exception: the bound uses their present values."""
     kinds, parents, mimic = TREES[name]
     rng = np.random.default_rng(5)

@@ -40,7 +40,7 @@ def test_patch_has_the_stiffness_it_is_given(name, poisson):
     assert ratio.max() / ratio.min() < 1.01
 
 
-def test_hinge_does_not():
+def test_hinge_is_stiffer_than_given():
     """The known defect of the hinge model, which the patch model avoids."""
     ratio = cylinder_ratios("right", "hinge", 0.0)
     assert ratio.min() > 2.5

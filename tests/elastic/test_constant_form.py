@@ -105,7 +105,7 @@ def test_the_form_is_the_sum_of_its_elements(rest, bending_model, damped, woven)
 
 @pytest.mark.parametrize("woven", [False, True])
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
-def test_it_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_model, woven):
+def test_the_form_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_model, woven):
     """Flat, undamped, shear softer than yarns: no local/global iteration raises the energy."""
     rng = np.random.default_rng(1)
     elastic, X, _, _ = problem(False, bending_model, 0.0, woven, rng)

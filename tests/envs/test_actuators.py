@@ -134,7 +134,7 @@ def test_actions_beyond_their_range_are_clipped():
     assert torch.equal(ends[0].tools["points"], ends[1].tools["points"])
 
 
-def test_what_failed_has_no_graph_and_the_others_have(monkeypatch):
+def test_failed_environments_have_no_graph_and_others_have(monkeypatch):
     """Environment 1 fails in its second transition, and continues from there."""
     env = dc.envs.make("FoldCloth", 2, size=6, opens_at=-1.0, reach=0.06, autoreset_mode="Disabled")
     env.reset(seed=0)

@@ -71,7 +71,7 @@ def test_stable_baselines_learns():
     assert reward.shape == (2,)
 
 
-def test_what_rsl_rl_asks_for():
+def test_rsl_rl_finds_its_interface():
     pytest.importorskip("tensordict")
     from diffcloth_torch.envs.rsl_rl import RslRlEnv
 

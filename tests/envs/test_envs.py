@@ -353,7 +353,7 @@ def begun():
         ("scripted", torch.zeros(1, 3), r"`scripted` must give finite floats \[B, 8\]"),
     ],
 )
-def test_what_a_task_gives_is_tried(name, value, message):
+def test_outputs_of_a_task_are_checked(name, value, message):
     wrong = type("Wrong", (envs.TASKS["FoldCloth"],), {"name": "Wrong", name: lambda s, e: value})
     with pytest.raises(dc.InvalidInput, match=message):
         envs.make(wrong(size=SMALL))

@@ -120,7 +120,7 @@ def test_a_dynamic_body_is_filled_evenly():
     assert by_mass.mass == 200 * volume  # to the bit
 
 
-def test_what_is_given_is_taken():
+def test_given_mass_properties_are_kept():
     center, inertia = [0.1, 0, 0], np.diag([1.0, 2, 2])
     body = dynamic(mass=3, center=center, inertia=inertia)
     assert body.mass == 3
@@ -136,7 +136,7 @@ def test_what_is_given_is_taken():
     assert inward.mass == 3
 
 
-def test_what_does_not_move_by_forces_has_no_mass():
+def test_bodies_that_no_force_moves_have_no_mass():
     body = dc.RigidBody.box(1.0, motion="kinematic")
     assert body.mass == 0
     assert not body.center.any()

@@ -115,14 +115,14 @@ def test_only_what_is_needed_is_computed(coupled, monkeypatch):
     assert [k for k, t in values.items() if t.grad is not None] == ["state.velocities"]
 
 
-def test_one_input_alone_gets_the_gradient_of_all_together(case):
+def test_a_single_input_gets_the_gradient_of_all_inputs(case):
     together = gradients(case, leaves(case))
     for name in together:
         assert_same(gradients(case, leaves(case, (name,))), {name: together[name]})
 
 
 @pytest.mark.parametrize("name", ["parameters.friction", "parameters.slip_velocity"])
-def test_what_friction_is_made_of_gets_its_gradient_alone_too(name):
+def test_a_single_friction_parameter_gets_its_gradient(name):
     """The slip velocity counts if a sheet sticks; its gradient is zero if the sheet slides."""
     case = scenes.regime("sticking")
     together = gradients(case, leaves(case))[name]
@@ -323,7 +323,7 @@ def test_a_step_that_did_not_converge_has_no_gradient(coupled):
     assert values["state.positions"].grad is None
 
 
-def test_one_unconverged_environment_refuses_for_its_batch():
+def test_an_unconverged_environment_refuses_for_its_batch():
     """A sheet that falls freely needs one iteration, one that vibrates more."""
     vertices, faces = scenes.grid(4, 4)
     sim = dc.Simulator(

@@ -135,7 +135,7 @@ def test_every_gradient_is_that_of_the_step(name, moving):
 
 @pytest.mark.quick("triangle")
 @pytest.mark.parametrize("name", ["triangle", "dented", "smooth_capsule"])
-def test_split_steps_too(name):
+def test_every_gradient_of_a_split_step_matches_differences(name):
     case = resting(name, moving=True, scheme="split")
     check(case, CONTACT, zero=without_slip(case))
 

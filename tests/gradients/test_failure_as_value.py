@@ -156,7 +156,7 @@ def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, s
 
 
 @by_kind
-def test_a_loss_that_depends_on_it_raises_its_error(kind):
+def test_a_loss_of_a_failed_environment_raises_its_error(kind):
     sim = simulator(kind)
     after, leaves = step(kind, sim, sim.initial_state(B), targets(kind, sim))
     error, how = dc.InfeasibleMotion, "complete"
@@ -244,7 +244,7 @@ def test_rollouts_with_and_without_checkpoints_agree(kind, scheme, coupling):
 
 
 @by_block
-def test_it_raises_by_default(kind):
+def test_a_failure_raises_by_default(kind):
     sim = simulator(kind, throw=True)
     with pytest.raises(dc.InfeasibleMotion, match=rf"environments \[{FAILED}\]") as caught:
         sim.step(sim.initial_state(B), control(kind, targets(kind, sim)))
@@ -276,7 +276,7 @@ def test_an_intersecting_state_raises_in_any_case():
     assert caught.value.report.status[2] == "intersecting_state"
 
 
-def test_each_environment_has_its_own_error():
+def test_environments_have_separate_errors():
     """One environment runs out of iterations, another is squeezed, the others are free."""
     sim = failing_scenes.simulator("body", max_iterations=30)
     state = sim.initial_state(B)

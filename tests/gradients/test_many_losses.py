@@ -62,7 +62,7 @@ def test_every_input_gets_the_gradients_of_a_loop(name, scheme):
 
 
 @pytest.mark.parametrize("names", [["state.velocities"], ["parameters.friction"]])
-def test_one_input_alone_gets_the_gradients_of_a_loop(names):
+def test_a_single_input_gets_the_gradients_of_a_loop(names):
     outputs, leaves = taken(scenes.regime("pinned"))
     cotangents = random_cotangents(outputs)
     values = [leaves[name] for name in names]

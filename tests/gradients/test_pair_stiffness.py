@@ -56,7 +56,7 @@ def case(scheme, metric, iterations):
 
 @pytest.mark.parametrize("iterations", [1, 2])
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["coupled", "split-mass", "split-elastic"])
-def test_each_entry_has_its_gradient(scheme, iterations):
+def test_every_entry_of_the_stiffness_has_its_gradient(scheme, iterations):
     given = case(*scheme, iterations)
     loss = make_loss(given)
     found = gradients(given, loss)[NAME]

@@ -329,7 +329,7 @@ def test_every_gradient_is_that_of_the_step(name, scheme, iterations):
 
 
 @pytest.mark.parametrize("output", range(3), ids=["positions", "velocities", "body_forces"])
-def test_each_output_alone_has_its_gradient(output):
+def test_a_single_output_has_its_gradient(output):
     """Single outputs: the error of a small output cannot hide behind a large one."""
     case = scenes.regime("pinned", "coupled", None, 2)
     weights = [0.0, 0.0, 0.0]
@@ -504,7 +504,7 @@ def test_friction_iterations_change_the_step():
     assert 1e-7 < (x2 - x3).abs().max() < (x1 - x2).abs().max()
 
 
-def test_what_lands_feels_friction_in_the_same_step():
+def test_a_landing_sheet_has_friction_in_the_same_step():
     """No contact at the start: the second solve lags friction at the end of the first."""
     one, two = (scenes.regime("landing", friction_iterations=k) for k in (1, 2))
     values = one.inputs()

@@ -152,7 +152,7 @@ def test_tangents_are_the_transpose_of_gradients(name):
 
 
 @pytest.mark.parametrize("name", ["coupled-pinned", "split-elastic-pinned", "robot-floating"])
-def test_what_is_not_kept_is_found_again(name):
+def test_forgotten_factors_change_no_bit_of_tangents(name):
     core, inputs, result = taken(name)
     names, tangents = directions(inputs)
     fresh = core.forward(inputs, True, 1)
@@ -165,7 +165,7 @@ def test_what_is_not_kept_is_found_again(name):
 
 
 @pytest.mark.parametrize("name", ["coupled-pinned", "split-elastic-folded_thick"])
-def test_each_direction_has_the_bits_that_it_has_alone(name):
+def test_several_directions_have_the_bits_of_single_ones(name):
     core, inputs, result = taken(name)
     names, tangents = directions(inputs)
     tape, kept = tape_of(result), result["kept"]

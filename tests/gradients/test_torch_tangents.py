@@ -311,11 +311,11 @@ class TestFailures:
             assert after.report.status == ("converged", "not_converged")
             return forward_ad.unpack_dual(after.positions).tangent
 
-    def test_they_raise(self):
+    def test_failed_environments_raise(self):
         with pytest.raises(dc.SimulationError, match=r"step: .*environments \[1\]"):
             self.run(torch.ones_like)
 
-    def test_the_others_have_theirs(self):
+    def test_other_environments_have_tangents(self):
         def first(x):
             direction = torch.zeros_like(x)
             direction[0] = 1.0

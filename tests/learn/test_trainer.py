@@ -306,7 +306,7 @@ class TestEntropy:
         torch.testing.assert_close(actions, before.tanh().float())
         assert float(actions.abs().max()) > 0.999
 
-    def test_its_worth_grows_where_there_is_too_little(self):
+    def test_the_weight_grows_with_too_little_entropy(self):
         for target, sign in ((5.0, 1), (-5.0, -1)):
             options = TrainerOptions("sapo", horizon=2, first_action=HOLD, target_entropy=target)
             trainer = Trainer(fold(), options, num_envs=2)
@@ -342,7 +342,7 @@ class TestEntropy:
         assert kept[0].shape == (3, 2)
         torch.testing.assert_close(kept[0], torch.full((3, 2), -2.0), atol=0.5, rtol=0)
 
-    def test_only_sapo_has_it(self):
+    def test_only_sapo_has_entropy(self):
         for algorithm in ("apg", "shac"):
             trainer = Trainer(fold(), TrainerOptions(algorithm, horizon=2), num_envs=2)
             assert trainer.policy.temperature == 0.0
@@ -587,7 +587,7 @@ def carry_strip(num_envs):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 @pytest.mark.quick("*-0", "apg-*")
-def test_it_improves(algorithm, seed):
+def test_training_improves_the_return(algorithm, seed):
     options = TrainerOptions(
         algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05, seed=seed
     )

@@ -125,7 +125,7 @@ def test_an_indefinite_matrix_is_found_wherever_it_is(name, threads):
     assert np.array_equal(solve(factor, b, threads=threads), expected)
 
 
-def test_one_workspace_serves_matrices_of_any_size():
+def test_a_workspace_serves_matrices_of_any_size():
     workspace = kernels.CholeskyWorkspace(2)
     small = cloth_matrix(10)
     for _ in range(3):
@@ -190,7 +190,7 @@ def at_random(count: int) -> list[list[int]]:
 
 @pytest.mark.parametrize("threads", [-1, 0, 1, 2, 3, 8])
 @pytest.mark.parametrize("before", [[], [[]], [[]] * 9, chain(20), tree(16), at_random(60)])
-def test_each_work_waits_for_those_before_it(before, threads):
+def test_works_wait_for_their_predecessors(before, threads):
     taken = kernels.run_team(before, threads, 0.0, 200)
     assert sorted(turn for _, turn in taken) == list(range(len(before)))
     assert all(0 <= member < max(threads, 1) for member, _ in taken)

@@ -313,7 +313,7 @@ def inertial(ixx, iyy, izz, ixy=0.0, mass=1.0):
         pytest.param(inertial(1, 1, 3), "above the sum of the other two", id="triangle"),
     ],
 )
-def test_what_forces_move_needs_an_inertia(tmp_path, content, message):
+def test_links_that_forces_move_need_an_inertia(tmp_path, content, message):
     parts = [link("base", ""), link("arm", content), joint("hinge", "base", "arm")]
     with pytest.raises(dc.InvalidInput, match=rf"'arm'> <inertial>: .*{message}"):
         load(tmp_path, *parts, actuation="torque")

@@ -302,7 +302,7 @@ def test_a_long_chain_is_no_problem(tmp_path):
     assert len(description.joints) == n - 1
 
 
-def test_what_is_not_read_is_left_out(tmp_path, capfd):
+def test_unread_elements_are_ignored_silently(tmp_path, capfd):
     extra = '<material name="m"/><gazebo><a/></gazebo><transmission name="t"/>'
     odd = '<dynamics damping="1" D="2"/><safety_controller k_velocity="1"/><calibration/>'
     visual = "<visual><geometry><teapot/></geometry></visual>"

@@ -120,7 +120,7 @@ def test_an_optimizer_with_groups_of_its_own_is_taken():
         ({"loss": lambda s: total(s) / 0}, dc.SimulationError, "the loss is inf: a gradient"),
     ],
 )
-def test_what_does_not_fit_is_refused(arguments, error, message):
+def test_bad_arguments_are_refused(arguments, error, message):
     accepted = {
         "simulate": bowl(),
         "loss": total,
@@ -146,7 +146,7 @@ def test_a_failed_status_fails_the_attempt_where_the_loss_is_one_number():
 
 
 @pytest.mark.parametrize("make", OPTIMIZERS)
-def test_what_the_optimizer_has_gathered_is_dropped_where_an_attempt_failed(make):
+def test_the_state_of_an_optimizer_is_dropped_after_a_failed_attempt(make):
     """From the point half way back, the loop continues as a loop that starts there."""
     seen = []
     fails = iter([False, False, True, False, False])
@@ -216,7 +216,7 @@ def test_an_attempt_of_which_no_environment_is_left_goes_back():
 
 @pytest.mark.parametrize("make", OPTIMIZERS)
 @pytest.mark.parametrize("options", [{}, {"clip": 0.7, "restart": True}])
-def test_each_environment_goes_its_own_way(make, options):
+def test_environments_descend_independently(make, options):
     """Clipping, restarts and losses of an environment are independent of the others."""
     starts = [1.0, -2.0, 0.1]
     together = leaf(*starts)
@@ -346,7 +346,7 @@ def test_a_loop_goes_on_with_the_same_bits(make, per_environment, tmp_path):
     assert len(found.history) == 4
 
 
-def test_torchs_own_random_numbers_go_on_too():
+def test_random_numbers_of_torch_are_resumed():
     def run(iterations, found=None):
         simulate = lambda v: [state_of(v["a"] + torch.randn(1, dtype=F64))]  # noqa: E731
         return dc.descend(
@@ -361,7 +361,7 @@ def test_torchs_own_random_numbers_go_on_too():
     assert torch.equal(run(6, half).next_variables["a"], whole.next_variables["a"])
 
 
-def test_what_was_reported_does_not_change_afterwards():
+def test_reported_results_do_not_change_afterwards():
     reports = []
     dc.descend(bowl(), total, {"a": leaf(1.0)}, ADAM, iterations=3, report=reports.append)
     assert [len(found.history) for found in reports] == [1, 2, 3]

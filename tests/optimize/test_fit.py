@@ -112,7 +112,7 @@ def test_the_jacobian_is_that_of_differences(strip):
     assert abs(found.correlation[0, 1]) < 1.0
 
 
-def test_what_acts_as_a_ratio_cannot_be_told_apart(strip):
+def test_parameters_that_act_as_a_ratio_cannot_be_separated(strip):
     """A stretched strip at rest depends only on the ratio of stiffness to weight."""
     sim = hanging()
     with torch.no_grad():
@@ -136,7 +136,7 @@ def test_what_acts_as_a_ratio_cannot_be_told_apart(strip):
     assert "stretch" in str(found.unidentifiable[0])
 
 
-def test_nothing_is_known_of_what_residuals_do_not_use():
+def test_nothing_is_known_of_variables_that_residuals_do_not_use():
     found = dc.fit(START, lambda p: torch.stack([p.stretch / 50 - 1, p.stretch / 52 - 1]))
     assert 50 < float(found.values["stretch"]) < 52
     assert found.intervals["bending"] == (0.0, np.inf)
@@ -376,7 +376,7 @@ def test_residuals_that_leave_torch_are_refused(strip, method, count, leave, mes
         dc.fit(START, residuals, method=method, max_evaluations=2)
 
 
-def test_other_errors_of_residuals_are_their_own():
+def test_other_errors_of_residuals_are_raised_unchanged():
     def residuals(parameters):
         if torch._C._are_functorch_transforms_active():
             raise RuntimeError("my own")

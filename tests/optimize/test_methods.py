@@ -32,7 +32,7 @@ def test_other_methods_end_at_the_same_place(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_they_stay_within_bounds(name):
+def test_methods_stay_within_bounds(name):
     """The best offset is near -.3."""
     free = VARIABLES | {"offset": dc.Variable(0.0, bounds=(-0.1, 1))}
     found = dc.fit(free, residuals, **METHODS[name])
@@ -41,7 +41,7 @@ def test_they_stay_within_bounds(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_they_go_on_with_the_same_bits(name, tmp_path):
+def test_methods_resume_with_the_same_bits(name, tmp_path):
     options = METHODS[name] | {"max_evaluations": 12, "resume": tmp_path}
     count = 0
 

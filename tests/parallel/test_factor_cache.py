@@ -52,7 +52,7 @@ def test_a_graph_may_outlive_its_simulator():
     after.positions.sum().backward()
 
 
-def test_what_is_kept_may_outlive_the_core():
+def test_kept_factors_may_outlive_the_core():
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(5, 5)]), 0.01)
     inputs, _ = sim._inputs(sim.initial_state(), None, None)
     arrays = {name: as_array(tensor) for name, tensor in inputs.items()}

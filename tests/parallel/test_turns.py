@@ -41,7 +41,7 @@ def same(a, b):
     return all(torch.equal(p, q) for p, q in zip(a, b, strict=True))
 
 
-def test_what_took_longest_begins_the_next_step(uneven):
+def test_the_slowest_environment_begins_the_next_step(uneven):
     simulator, state = uneven
     with threads(1), torch.no_grad():
         after = simulator.step(state)

@@ -227,7 +227,7 @@ def test_a_flag_streams_and_flutters_in_wind_and_hangs_without():
     assert np.ptp(early) < 0.2 * np.ptp(aside)  # from almost nothing
 
 
-def test_pins_bear_what_the_wind_does():
+def test_pins_bear_the_force_of_the_wind():
     """A sheet at rest transfers the whole force of the air to its pins."""
     cloth = sheet(rotation((1, 0, 0), np.pi / 2), pins={"all": range(36)})
     sim = simulator(cloth)

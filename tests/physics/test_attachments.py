@@ -144,7 +144,7 @@ def test_a_free_body_and_cloth_keep_their_momentum():
     assert float((momentum - reference).norm()) < 1e-12 * float(reference.norm())
 
 
-def test_what_is_released_is_not_there():
+def test_a_released_attachment_has_no_effect():
     sim = sewn_to_box()
     state = sim.initial_state()
     released = sim.step(state, sim.control(attachment_weights={"seam": [0.0, 0.0]}))
@@ -202,7 +202,7 @@ def test_a_stiff_seam_closes(rest_length, rise):
     assert float(apart.max()) < max(5e-3, rest_length + 1e-4)
 
 
-def test_a_kinematic_hand_carries_what_it_holds_and_lets_go():
+def test_a_kinematic_hand_carries_and_releases_a_sheet():
     hand = dc.RigidBody.box(
         0.04, motion="kinematic", pose=[-0.15, -0.15, 0.06, 1, 0, 0, 0], name="hand"
     )

@@ -96,7 +96,7 @@ def test_the_default_of_one_cloth_is_one_number_as_before():
     assert stiffness.item() == pytest.approx(3718.8886128683357, rel=1e-12)
 
 
-def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
+def test_a_pair_has_the_larger_stiffness_of_its_two_surfaces():
     soft, stiff = sheet(8), sheet(8, 0.1, stretch=9e3)
     light, heavy = box(0.2, 0, 0, 0.3, name="light"), box(80.0, 0, 0, 0.5, name="heavy")
     found = pairs(simulator([soft, stiff], [FLOOR, light, heavy]))
@@ -113,7 +113,7 @@ def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
                 assert found[a, b] == max(needs[a], needs[b])
 
 
-def test_what_a_cloth_needs_is_that_of_the_cloth_alone():
+def test_a_cloth_needs_the_stiffness_of_a_scene_of_its_own():
     options = {"barrier_distance": 3e-3}
     cloths = [sheet(8, thickness=1e-3), sheet(6, 0.1, stretch=90.0, density=0.4)]
     found = pairs(simulator(cloths, [FLOOR], **options))
@@ -122,7 +122,7 @@ def test_what_a_cloth_needs_is_that_of_the_cloth_alone():
         assert found[f"cloth{k}", "floor"] == alone["cloth0", "cloth0"]
 
 
-def test_joints_count_where_nothing_else_does():
+def test_joints_count_only_against_static_surfaces():
     found = pairs(simulator([sheet()], [FLOOR, box(0.7, 1, 0, 0.2, name="box")], [arm()]))
     finger = "hand/left_finger"
     alone = pairs(simulator([], [FLOOR], [arm()], barrier_distance=0.005))
@@ -185,7 +185,7 @@ def at_half_gap(xi, reach):
 
 
 @pytest.mark.parametrize(("mass", "of"), [(1e-3, "cloth0"), (50.0, "ball")])
-def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
+def test_a_radius_does_not_reduce_the_stiffness_of_a_surface(mass, of):
     """With additional thickness: a cloth needs a curvature at half the gap, a body a slope."""
     reach, radius, thicknesses = 3e-3, 0.04, {"cloth0": 2e-3, "ball": 7e-3}
     ball = dc.RigidBody.sphere(
@@ -209,7 +209,7 @@ def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
     assert abs(found["cloth0", "ball"] * with_radius) == pytest.approx(need, rel=1e-9)
 
 
-def test_without_gravity_a_body_needs_what_stops_it_within_a_step():
+def test_a_body_without_gravity_needs_a_stiffness_that_stops_it_within_a_step():
     """Equal to the need at a gravity that falls through the barrier distance in one step."""
     reach = 4e-3
     found = []
@@ -349,7 +349,7 @@ def gradient_and_end(sim, state, parameters):
 
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 @pytest.mark.parametrize(("scheme", "coupling"), WAYS)
-def test_one_number_is_the_same_for_every_pair(scheme, coupling):
+def test_a_single_number_applies_to_every_pair(scheme, coupling):
     """Bit for bit, and its gradient is the sum of theirs."""
     sim = several(scheme, coupling, barrier_stiffness=1500.0)
     count = len(sim.surfaces)

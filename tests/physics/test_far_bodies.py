@@ -124,7 +124,7 @@ def test_no_bit_changes(scenes, name, far):
     assert touched > steps // 2 or name not in OWN
 
 
-def test_every_scene_that_is_timed_is_looked_at(scenes):
+def test_every_timed_scene_is_tested(scenes):
     assert set(TIMED) == set(timed(scenes))
 
 

@@ -15,7 +15,7 @@ MINUTE = 60.0
 
 @pytest.mark.quick("box")
 @pytest.mark.parametrize("what", ["box", "cloth"])
-def test_it_moves_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeypatch):
+def test_a_held_object_creeps_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeypatch):
     monkeypatch.syspath_prepend(ROOT)
     sticking = importlib.import_module("benchmarks.sticking")
     _, sunk, law = sticking.held(what, dc.ContactOptions().slip_velocity, MINUTE)

@@ -65,7 +65,7 @@ def shaken(sim):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_it_finds_the_positions_of_newton(name):
+def test_projective_dynamics_finds_the_positions_of_newton(name):
     """Over three steps, each from the same state for both."""
     newton, projective = (
         simulator(SCENES[name](), elastic) for elastic in ("newton", "projective")
@@ -79,7 +79,7 @@ def test_it_finds_the_positions_of_newton(name):
         assert (found.positions - state.positions).abs().max() < 1e-10
 
 
-def test_it_has_the_contact_and_the_gradient_of_newton():
+def test_projective_dynamics_has_the_contact_and_the_gradient_of_newton():
     """A sheet that slides on a box: both stages, and their adjoint."""
     results = []
     for elastic in ("newton", "projective"):
@@ -117,7 +117,7 @@ def test_parameters_and_history_leave_no_trace():
         assert torch.equal(positions, once)
 
 
-def test_its_iterations_are_bounded():
+def test_iterations_of_projective_dynamics_are_bounded():
     sim = simulator(SCENES["stiff"](), "projective", max_iterations=1, metric="elastic")
     state, control = shaken(sim)
     with pytest.raises(dc.NotConverged, match=r"iterations of the step .* are used up") as e:
@@ -149,7 +149,7 @@ def test_forces_beyond_what_float64_resolves_are_reported(force):
     assert e.value.report.residual > TOLERANCE
 
 
-def test_a_saddle_stops_it_and_has_no_gradient():
+def test_a_saddle_stops_projective_dynamics_and_has_no_gradient():
     """The iterations ignore curvature: a planar sheet stays planar, and backward reports it."""
     stiff = dc.Material(stretch=1e4)
     upright = dc.Cloth.grid(

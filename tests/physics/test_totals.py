@@ -88,7 +88,7 @@ def test_the_parts_of_the_energy_add_up_to_it(sim):
         assert torch.equal(part[0], parts[name])
 
 
-def test_each_part_is_what_its_name_says():
+def test_parts_of_the_energy_are_those_of_their_names():
     """A square that is stretched, lies within reach of the floor, and pulls at its soft pins."""
     cloth = dc.Cloth.grid(
         3, 3, size=0.2, material=dc.Material(bending=0.0), soft_pins={"all": range(9)}

@@ -34,7 +34,7 @@ def plate(x, y, name):
 
 
 @pytest.mark.parametrize("barrier_distance", [5e-4, 4e-3])
-def test_what_a_grip_holds_creeps_no_more_when_it_turns_around(barrier_distance):
+def test_a_held_box_creeps_no_more_in_a_turning_grip(barrier_distance):
     """A box between two plates, pulled by a third of the largest friction."""
     side, seconds, dt = 0.05, 1.0, 0.02
     x = side / 2 + 0.01 + 0.6 * barrier_distance

@@ -42,7 +42,7 @@ def test_every_step_of_a_drape_converges(name, drape):
 
 @pytest.mark.quick("sphere")
 @pytest.mark.parametrize("name", ["sphere", "box"])
-def test_what_local_global_iterations_give_up_is_solved_by_newton(name, drape):
+def test_newton_solves_steps_that_local_global_iterations_give_up(name, drape):
     steps, local_global = drape(name, "projective")
     _, newton = drape(name, "newton")
     state = local_global.initial_state()

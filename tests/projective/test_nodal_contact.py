@@ -187,7 +187,7 @@ def test_a_sheet_sticks_without_creep_below_its_friction_angle_and_slides_above(
 
 
 @pytest.mark.parametrize("tolerance", np.geomspace(1e-2, 1e-9, 8))
-def test_what_is_left_of_a_step_is_below_the_tolerance(tolerance):
+def test_the_residual_of_a_step_is_below_the_tolerance(tolerance):
     for case in CASES:
         after = on_body("sphere", case, tolerance=float(tolerance))()
         assert after.report.residual <= tolerance
@@ -202,7 +202,7 @@ def test_a_slide_accelerates_as_coulomb_says():
 
 
 @pytest.mark.parametrize("excess", [1e-2, 1e-5, 1e-7])
-def test_what_hardly_slips_is_hardly_moved_across(excess):
+def test_a_vertex_that_hardly_slips_hardly_moves_across(excess):
     """Friction turns with the slip: v_y = (1 - mu g_z / g_x) h g_y, for a small g_y."""
     h, mu = 0.01, 0.5
     sim, state, _ = patch(mu, dt=h)
@@ -282,7 +282,7 @@ def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
 
 
 @pytest.mark.parametrize("thick", [0, 1])
-def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
+def test_cloths_touch_at_their_own_thickness_and_friction(thick):
     """Two sheets glide low over a floor; one sheet is thick and rough."""
     sheets = [
         dc.Cloth.grid(
@@ -322,7 +322,7 @@ def test_a_vertex_touches_the_body_whose_band_it_is_deepest_in(thick_first):
     assert after.report.contacts["cloth0", f"body{1 - thick_first}"].count == 9
 
 
-def test_an_obstacle_carries_what_sticks_to_it():
+def test_an_obstacle_carries_a_sticking_sheet():
     sim, state, _ = patch(0.8)
     body = sim.scene.bodies[0]
     moving = dc.RigidBody.plane(
@@ -348,7 +348,7 @@ def test_an_obstacle_carries_what_sticks_to_it():
 
 
 @pytest.mark.parametrize("missing", [1e-9, 0.1, 0.24, -0.01])
-def test_what_arrives_at_the_very_end_of_a_step_touches(missing):
+def test_a_sheet_that_arrives_at_the_very_end_of_a_step_touches(missing):
     """The floor stops a sheet that would enter in the last quarter of the step, and no other."""
     sim, state, _ = patch(0.5)
     gap, speed = 1e-3, 1.0

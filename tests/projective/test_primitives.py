@@ -62,7 +62,7 @@ def test_derivatives_are_those_of_differences(kind):
 
 
 @pytest.mark.parametrize("kind", SOLIDS)
-def test_where_many_points_are_nearest_one_normal_is_taken(kind):
+def test_a_single_normal_is_chosen_among_many_nearest_points(kind):
     distance, normal, *_ = nearest(kind, (0.0, 0.0, 0.0))
     assert distance < 0.0
     assert np.linalg.norm(normal) == 1.0

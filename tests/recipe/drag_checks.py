@@ -23,7 +23,7 @@ SOLVERS = [
 ]
 
 
-def test_this_is_the_copy():
+def test_the_tested_package_is_the_copy():
     assert Path(dc.__file__).is_relative_to(Path(__file__).parents[2])
     assert "drag" in vars(dc.Parameters)
 

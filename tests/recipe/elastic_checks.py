@@ -12,12 +12,12 @@ def simulator(scheme, **options):
     return dc.Simulator(dc.Scene([cloth], **options), 0.01, scheme=scheme)
 
 
-def test_it_has_a_name_and_abilities():
+def test_the_scheme_has_a_name_and_abilities():
     assert list(_core.schemes)[-1] == "elastic"
     assert _core.schemes["elastic"]["barrier"] is False
 
 
-def test_it_is_the_coupled_scheme_where_nothing_touches():
+def test_the_scheme_equals_the_coupled_scheme_without_contact():
     ends = []
     for scheme in ("coupled", "elastic"):
         sim = simulator(scheme)

@@ -74,7 +74,7 @@ def judge(pin, mechanism):
     return model, joint
 
 
-def test_this_is_the_copy(tmp_path):
+def test_the_tested_package_is_the_copy(tmp_path):
     assert Path(dc.__file__).is_relative_to(Path(__file__).parents[2])
     assert load(tmp_path).mechanism.kind == ("fixed", "screw", "revolute", "screw")
 

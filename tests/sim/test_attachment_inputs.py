@@ -151,7 +151,7 @@ def test_a_control_refuses(sim, control, message):
         sim.step(sim.initial_state(), dc.Control(**tensors))
 
 
-def test_each_attachment_pulls_to_its_own_targets():
+def test_attachments_pull_to_their_own_targets():
     """Stored energies computed by hand; targets may be set together or by name."""
     first = dc.Attachment(("sheet", [0, 2]), stiffness=5.0, name="first")
     between = dc.Attachment(("sheet", 4), ("box", [0, 0, 0]), stiffness=0.1)
@@ -180,7 +180,7 @@ def test_no_environment_is_pulled_to_a_target_that_is_not_set(sim):
         sim.step(sim.initial_state(3), pulled)
 
 
-def test_what_a_control_does_not_say(sim):
+def test_unset_fields_of_a_control_have_defaults(sim):
     """Without a target a picker is released; with a target it pulls with its full stiffness."""
     state = sim.initial_state()
     targets = state.positions[[0, 2]] + 0.05

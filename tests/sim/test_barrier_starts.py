@@ -254,7 +254,7 @@ def test_a_force_that_holds_against_the_barrier_holds_the_warning_back():
 
 
 @pytest.mark.parametrize("how", ["rollout", "equilibrium"])
-def test_what_rests_in_the_barrier_does_not_warn(how):
+def test_a_surface_at_rest_in_the_barrier_does_not_warn(how):
     # A sheet that is held on a table and hangs over its edge.
     table = dc.RigidBody.box((0.2, 0.3, 0.1), pose=[0, -0.15, -0.05, 1, 0, 0, 0])
     cloth = dc.Cloth.grid(

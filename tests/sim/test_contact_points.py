@@ -163,7 +163,7 @@ def batch_of(states):
     return dc.stack(states)
 
 
-def test_environments_are_padded_and_those_alone():
+def test_environments_of_a_batch_are_padded_single_ones():
     sim = scenes.regime("sliding").sim
     start = scenes.regime("sliding").state
     lifted = start.replace(positions=start.positions + torch.tensor([0.0, 0.0, 0.05], dtype=F64))
@@ -213,7 +213,7 @@ def test_single_contacts_have_no_gradient_and_say_so():
     assert not case.sim.contacts(state.detach()).gaps.requires_grad
 
 
-def test_what_has_no_contacts_of_a_step_is_refused():
+def test_states_without_contacts_of_a_step_are_refused():
     sim = scenes.regime("sliding").sim
     with pytest.raises(dc.InvalidInput, match="`state` must be the result of a step"):
         sim.contacts(sim.initial_state())

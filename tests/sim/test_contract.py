@@ -531,7 +531,7 @@ def test_batched_inputs_of_a_single_state_are_refused(sim):
         sim.step(sim.initial_state(2), dc.Control(forces=torch.zeros(3, VERTICES, 3)))
 
 
-def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
+def test_values_per_environment_or_per_cloth_must_be_distinguishable(sim):
     state, parameters = sim.initial_state(2), sim.parameters()
     with pytest.raises(
         dc.InvalidInput, match=r"^step: `parameters\.stretch` of shape \[2\] could .*\[2, 2\]"
@@ -544,7 +544,7 @@ def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
     sim.step(sim.initial_state(FACES), None, parameters.replace(stretch=500.0))
 
 
-def test_one_value_of_one_environment_and_one_cloth_is_both():
+def test_a_value_of_one_environment_and_one_cloth_is_both():
     sheet = dc.Cloth(np.eye(3), [[0, 1, 2]], name="sheet")  # of one face
     sim = dc.Simulator(dc.Scene([sheet]), DT)
     heavy = torch.tensor([0.7], dtype=F64)
@@ -683,7 +683,7 @@ def differentiable(sim, batch_size=None):
 
 
 @pytest.mark.parametrize("batch_size", [None, 2])
-def test_one_leaf_at_a_time_gets_the_gradient_of_all_together(sim, batch_size):
+def test_a_single_leaf_gets_the_gradient_of_all_leaves(sim, batch_size):
     state, leaf, control, parameters = differentiable(sim, batch_size)
 
     def loss(leaf, control, parameters):

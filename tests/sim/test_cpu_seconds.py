@@ -66,7 +66,7 @@ def test_solves_of_a_staggered_coupling_add_up(coupling):
     assert 0 < report.cpu_seconds <= sum(report.seconds.values()) + 1e-3
 
 
-def test_it_is_saved_and_shown(tmp_path):
+def test_processor_time_is_saved_and_shown(tmp_path):
     sim = hanging(5)
     state = sim.step(sim.initial_state())
     torch.save(state, tmp_path / "state.pt")

@@ -430,7 +430,7 @@ def test_the_gradient_is_minus_the_forces_of_a_step_without_friction():
 
 
 @pytest.mark.parametrize("soft", [False, True], ids=["pins", "soft_pins"])
-def test_it_vanishes_at_an_equilibrium(soft):
+def test_the_gradient_vanishes_at_an_equilibrium(soft):
     """The gradient vanishes at free vertices; at pins it is the holding force."""
     vertices, faces = scenes.grid(7, 7, edge=0.04, seed=5)
     held = {"corners": [0, 6, 42, 48]}

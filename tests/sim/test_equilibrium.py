@@ -135,7 +135,7 @@ def test_a_heavy_cantilever_is_an_elastica(directions, D):
     assert -end[-4:, 2].mean() == pytest.approx(abs(drop), rel=0.02)
 
 
-def test_the_end_of_a_long_rollout_is_one():
+def test_the_end_of_a_long_rollout_is_an_equilibrium():
     """Sticking contacts hold; the rollout still creeps by .01 mm/s after 6 s."""
     contact = dc.ContactOptions(slip_velocity=1e-5)
     sim = drape(contact=contact)
@@ -177,7 +177,7 @@ def test_a_stiffer_disk_drapes_less(cusick):
     assert coefficients[0] < coefficients[1] < 1.0
 
 
-def test_without_friction_a_rollout_ends_there():
+def test_a_rollout_without_friction_ends_at_the_equilibrium():
     cloth = strip(12, 0.2, 0.03, material=dc.Material(bending=1e-4, damping=0.05))
     pins = {"clamp": range(8)}
     cloth = dc.Cloth(cloth.vertices, cloth.faces, material=cloth.material, pins=pins)
@@ -431,7 +431,7 @@ def test_environments_of_a_batch_are_those_alone():
         assert torch.equal(batch.body_forces[k], alone.body_forces)
 
 
-def test_what_resists_motion_changes_nothing_at_rest():
+def test_damping_and_drag_change_nothing_at_rest():
     """The equilibrium and the search, including all values of the report, are equal."""
     sim = cantilever()
     names, ends = ("damping", "normal_drag", "tangential_drag"), []
@@ -446,7 +446,7 @@ def test_what_resists_motion_changes_nothing_at_rest():
     assert again.report.iterations < found.report.iterations
 
 
-def test_split_finds_the_same_one():
+def test_split_finds_the_same_equilibrium():
     alike = [s.equilibrium(s.initial_state()).positions for s in (drape(), drape("split"))]
     assert torch.equal(*alike)
 
@@ -472,7 +472,7 @@ def test_a_box_that_is_tilted_comes_to_lie_on_its_table(degrees, with_cloth):
     assert 0.05 < float(end[2]) < 0.053
 
 
-def test_the_time_step_of_the_search_is_not_told(monkeypatch):
+def test_messages_omit_the_time_step_of_the_search(monkeypatch):
     def turns(self, *arguments):
         raise dc.TurnedTooFar("step: take a time step of at most 0.06 s", environments=[2])
 
@@ -484,7 +484,7 @@ def test_the_time_step_of_the_search_is_not_told(monkeypatch):
     assert "time step" not in str(raised.value)
 
 
-def test_what_falls_is_named():
+def test_a_falling_object_is_named():
     sheet = dc.Cloth.grid(4, 4, (0.2, 0.2), name="sheet")
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)
     with pytest.raises(dc.SimulationError, match="equilibrium: 'sheet' is free to move"):
@@ -505,7 +505,7 @@ def test_the_environments_in_which_something_falls_are_named():
     assert error.value.environments == (1, 3)
 
 
-def test_what_may_slide_is_named():
+def test_a_sheet_that_may_slide_is_named():
     sheet = dc.Cloth.grid(
         4, 4, (0.2, 0.2), pose=[0, 0, 0.002, 1, 0, 0, 0], name="sheet",
         material=dc.Material(friction=0.0),
@@ -535,7 +535,7 @@ def test_a_body_that_floats_is_named():
         sim.equilibrium(sim.initial_state())
 
 
-def test_what_has_no_equilibrium_is_refused():
+def test_schemes_without_equilibria_are_refused():
     sim = cantilever()
     box = dc.RigidBody.box(0.1, pose=[0, 0, -1, 1, 0, 0, 0], nodal_contact=True, name="box")
     nodal = dc.Simulator(dc.Scene(sim.scene.cloths, [box]), 0.01, scheme="split")
@@ -556,7 +556,7 @@ def test_too_few_iterations_are_a_failure_or_a_value():
     assert sim.equilibrium(sim.initial_state()).report.status == "not_converged"
 
 
-def test_what_does_not_settle_has_no_gradient(monkeypatch):
+def test_an_unsettled_equilibrium_has_no_gradient(monkeypatch):
     """With `throw=False` the failure is a value, and backward raises."""
     monkeypatch.setattr(equilibrium, "_SETTLED", 0.0)
     monkeypatch.setattr(equilibrium, "_REPEATS", 1)

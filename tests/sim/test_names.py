@@ -94,7 +94,7 @@ def test_an_overlap_is_named():
 
 
 @pytest.mark.parametrize("load", [1.0, 1e4])
-def test_what_is_pressed_too_hard_is_named(load):
+def test_surfaces_pressed_too_hard_are_named(load):
     mat = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 0.003, 1, 0, 0, 0], name="mat")
     floor = dc.RigidBody.plane(2.0, name="floor")
     weak = dc.ContactOptions(barrier_stiffness=1e-16, barrier_distance=0.002)

@@ -70,7 +70,7 @@ def test_an_arm_sags_on_its_drives(arm, stiffness):
     assert not found.joint_velocities.any()
 
 
-def test_what_resists_motion_changes_nothing_at_rest(arm):
+def test_damping_and_viscosity_change_nothing_at_rest(arm):
     """The equilibrium and the search are equal for any viscosity."""
     sim = alone(arm(stiffness=8.0, damping=1.0))
     ends = []
@@ -195,7 +195,7 @@ def test_a_batch_of_arms_has_the_bits_of_each(arm):
         assert torch.equal(batch.joint_positions[k], single.joint_positions)
 
 
-def test_a_rollout_ends_there(arm):
+def test_a_rollout_ends_at_the_equilibrium(arm):
     """At any time step: velocity products of a fall had moved its end by the order of h squared."""
     errors = []
     for dt in (0.02, 0.01):
@@ -414,7 +414,7 @@ def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, na
 
 
 @pytest.mark.parametrize("table", [None, -1.0])
-def test_what_a_hand_holds_by_friction_stays_in_it(table):
+def test_an_object_held_by_friction_stays_in_the_hand(table):
     """Long steps must not begin at the inertial prediction, which is outside the closing grip."""
     hand = dc.Robot.load(
         dc.robots.GRIPPER,

@@ -64,7 +64,7 @@ def test_a_limit_of_a_step_is_its_criterion(scheme, options, criterion):
     assert report.criterion == criterion
 
 
-def test_each_environment_of_a_batch_has_its_own():
+def test_environments_of_a_batch_have_separate_criteria():
     sim, start, control = pushed_batch()
     report = sim.step(start, control).report
     assert report.status == ("converged", "infeasible_motion", "not_converged")
@@ -81,7 +81,7 @@ def test_a_start_that_intersects_is_not_solved():
     assert caught.value.report.criterion == "no_solve"
 
 
-def test_it_is_selected_stacked_chosen_and_saved(tmp_path):
+def test_the_criterion_is_selected_stacked_chosen_and_saved(tmp_path):
     sim, start, control = pushed_batch()
     state = sim.step(start, control)
     report = state.report

@@ -78,9 +78,9 @@ def test_a_free_body_that_meets_nothing_flies_at_once():
     assert (flights(turn=0.5) - 1).abs().max() < 1e-12
 
 
-def test_a_free_body_that_would_end_behind_a_surface_does_not():
+def test_a_free_body_that_would_end_behind_a_surface_does_not_fly_at_once():
     assert flights(height=0.05 + 0.01, speed=3.0)[0] < 0.99
 
 
-def test_a_body_on_a_spring_does_not():
+def test_a_body_on_a_spring_does_not_fly_at_once():
     assert flights(attached=True)[0] < 0.99

@@ -30,7 +30,7 @@ def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
 
 # Three starts within 1e-9 m, with AVX-512 and portable instructions, take 107 and 89.
 @pytest.mark.parametrize(("name", "most"), [("two-sheets", 115), ("self-contact", 100)])
-def test_what_slides_is_expected_to_slide_on(monkeypatch, name, most):
+def test_sliding_contacts_are_expected_to_slide_on(monkeypatch, name, most):
     """Factorizations of eight steps; 128 and 116 if each step assumed sticking at its start."""
     monkeypatch.syspath_prepend(ROOT)
     scenes = importlib.import_module("benchmarks.scenes")

@@ -35,7 +35,7 @@ def states(scheme):
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
-def test_it_finds_the_same_minimum(scheme, monkeypatch):
+def test_dropped_factors_find_the_same_minimum(scheme, monkeypatch):
     kept = states(scheme)
     monkeypatch.setattr(cores._core, "Simulator", partial(cores._core.Simulator, large_factor=0))
     dropped = states(scheme)
@@ -57,7 +57,7 @@ def swing():
     return result
 
 
-def test_a_dear_factor_is_used_for_longer(monkeypatch):
+def test_an_expensive_factor_is_used_for_longer(monkeypatch):
     cheap = swing()
     monkeypatch.setattr(cores._core, "Simulator", partial(cores._core.Simulator, dear_factor=0.0))
     dear = swing()

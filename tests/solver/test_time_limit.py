@@ -139,7 +139,7 @@ def swarm(count, speed, **solver):
     return sim, state.replace(velocities=speed * torch.from_numpy(noise.reshape(-1, 3)))
 
 
-def test_time_is_looked_at_within_detection():
+def test_time_is_checked_within_collision_detection():
     """One search and one check of all pairs need seconds; the end checks only near pairs."""
     spent = []
     for limit in (None, 0.1):
@@ -151,7 +151,7 @@ def test_time_is_looked_at_within_detection():
     assert spent[1] < 0.5 * spent[0]
 
 
-def test_a_free_body_does_not_look_through_torn_sheets():
+def test_a_free_body_is_not_searched_along_torn_sheets():
     """An earlier version searched its contacts along the motion of all surfaces: .5 s."""
     ball = dc.RigidBody.sphere(0.05, motion="dynamic", mass=0.1, pose=[0, 0, 0.9, 1, 0, 0, 0])
     sim, state = torn(12, 1e5, [ball], throw=False, max_iterations=2)

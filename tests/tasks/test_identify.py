@@ -84,7 +84,7 @@ SHORT = {
 @pytest.mark.quick("fit_cantilever", "fit_hang")
 @pytest.mark.rounding
 @pytest.mark.parametrize("name", SHORT)
-def test_what_is_known_is_found_on_a_coarser_mesh(name):
+def test_known_values_are_found_on_a_coarser_mesh(name):
     changes, shares = SHORT[name]
     first = read_config(CONFIGS / f"{name}.yaml").fit.trajectories
     quiet = [f"fit.trajectories.{k}.noise=1e-6" for k in range(len(first))]
@@ -297,7 +297,7 @@ def test_the_benchmark_runs(option, expected):
     assert re.search(expected, result.stdout), result.stdout
 
 
-def test_what_a_bias_leaves_is_what_random_intervals_count(monkeypatch):
+def test_a_biased_share_is_the_count_of_random_intervals(monkeypatch):
     monkeypatch.syspath_prepend(CONFIGS.parent)
     identification = importlib.import_module("benchmarks.identification")
     biased_share, shares = identification.biased_share, identification.shares

@@ -165,7 +165,7 @@ class TestPages:
         assert capsys.readouterr().out == ""
         assert not rich.get_console().quiet
 
-    def test_what_is_shown_later_does_not_change_with_the_tensors(self, falling):
+    def test_a_shown_state_does_not_change_with_its_tensors(self, falling):
         scene, states = falling
         browser = Browser(scene)
         state = states[0].replace(positions=states[0].positions.clone())
@@ -372,7 +372,7 @@ class TestFits:
         with pytest.raises(dc.InvalidInput, match="one for each of 1 scenes, got 0"):
             FittedPage([scene]).show([])
 
-    def test_what_is_resumed_has_its_viewer_already(self, tmp_path):
+    def test_a_resumed_fit_refuses_another_viewer(self, tmp_path):
         result = CliRunner().invoke(main, ["fit", "--resume", str(tmp_path), "--viewer", "web"])
         assert result.exit_code == 2
         assert "--set or --viewer" in result.output

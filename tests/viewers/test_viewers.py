@@ -172,7 +172,7 @@ def has_hue(image, channel):
 
 @pytest.mark.usefixtures("pictures")
 class TestRecord:
-    def test_the_files_are_there(self, make_task, tmp_path):
+    def test_the_files_exist(self, make_task, tmp_path):
         task = make_task("output.pictures.frames=true", "output.pictures.sheet=2")
         record(task, tmp_path)
         assert (tmp_path / "animation.mp4").stat().st_size > 500
@@ -280,7 +280,7 @@ class TestRecord:
             pytest.param(KeyboardInterrupt(), False, id="interrupt"),
         ],
     )
-    def test_what_led_to_a_failed_step_is_drawn(self, make_task, tmp_path, error, drawn):
+    def test_states_before_a_failed_step_are_drawn(self, make_task, tmp_path, error, drawn):
         task = make_task("output.pictures.video=none")
 
         def failing():
@@ -526,7 +526,7 @@ class TestCamera:
         with pytest.raises(dc.InvalidInput, match=message):
             dc.Camera(**{"target": [0, 0, 0], **changes})
 
-    def test_what_is_seen_is_what_lies_before_it(self, tmp_path):
+    def test_a_camera_sees_the_objects_in_front(self, tmp_path):
         """A red sheet to the right of a green one, seen from both sides, and upside down."""
         pytest.importorskip("pyvista")
         up = [0.7071, 0.7071, 0, 0]  # stands upright
