@@ -1,6 +1,6 @@
 """Compare the integrators: momentum, bias of fits by the time step, energy in contact, and cost.
 
-    python -m benchmarks.integrators              # all of it: about twenty minutes
+    python -m benchmarks.integrators              # all parts: about twenty minutes
     python -m benchmarks.integrators --part momentum --part drag
     python -m benchmarks.integrators --quick      # small forms of each part
 
@@ -9,7 +9,7 @@ Parts:
 momentum   Share of its angular momentum that a free sheet keeps in a second, by its spin and by the
            time step, and the change of its linear momentum.
 drag       A sheet swings from one edge in air. Error of its positions by the time step against the
-           second-order step with h / 16, and the drag that a fit to those finds.
+           second-order step with h / 16, and the drag that a fit to these positions finds.
 explicit   The same sheet against an explicit solver of SciPy (DOP853) for the same energies.
 damping    A sheet oscillates about its hanging shape; damping that a fit to data of h / 16 finds.
 drops      Random sheets fall on bodies and on themselves: the largest energy after contact over the
@@ -62,7 +62,7 @@ def main(parts: Sequence[str], scenes: int, quick: bool) -> None:
 
 
 def sheet(n: int, side: float = 0.5, **material: float) -> dc.Cloth:
-    """A sheet whose vertices are off a regular grid."""
+    """A sheet on a jittered grid."""
     grid = dc.Cloth.grid(n, n, side)
     vertices = np.array(grid.vertices)
     vertices[:, :2] += np.random.default_rng(0).uniform(-0.01, 0.01, (n * n, 2)) * side
@@ -142,7 +142,7 @@ def rms(a: Tensor, b: Tensor) -> float:
 
 
 def found(residual: Callable[[float], float], low: float, high: float) -> float:
-    """Where a residual is least."""
+    """Argument of the smallest residual."""
     from scipy.optimize import minimize_scalar
 
     options = {"maxiter": 12, "xatol": 1e-3 * (high - low)}
