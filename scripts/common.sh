@@ -1,4 +1,4 @@
-# Set-up that scripts/demo, scripts/test and .ci/run share; source it.
+# Shared set-up of scripts/demo, scripts/test and .ci/run; source this file.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv=$root/.venv
@@ -13,7 +13,7 @@ set_up() {
   install_package "$@"
 }
 
-# The first Python that is new enough, or nothing.
+# Print the first Python that is new enough, or nothing.
 find_python() {
   local name
   for name in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do
@@ -27,7 +27,7 @@ find_python() {
 
 has_library() { { ldconfig -p || /sbin/ldconfig -p; } 2>/dev/null | grep -q "$1"; }
 
-# Debian's names of what pip cannot bring and this machine lacks, with what each is for.
+# Print the Debian packages that pip cannot install and this machine lacks, each with its purpose.
 missing_system_packages() {
   local python
   python=$(find_python)
@@ -39,8 +39,8 @@ missing_system_packages() {
 import pathlib, sys, sysconfig
 sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' ||
     echo "python3-dev          # compiles the core"
-  # Found by hiding one library after the other: without a display, VTK draws through EGL on
-  # Mesa's software renderer, and it crashes without libX11.
+  # Determined by hiding one library after the other: without a display, VTK draws through EGL on
+  # Mesa's software renderer, and VTK crashes without libX11.
   has_library libEGL.so.1 || echo "libegl1              # pictures without a display"
   compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null ||
     echo "libgl1-mesa-dri      # pictures without a display"
@@ -50,8 +50,8 @@ sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' 
 
 install_system_packages() { install_packages "$(missing_system_packages)"; }
 
-# install_packages LINES: what they name, "package  # what it is for", where that needs no question:
-# as root, or with sudo without password.
+# install_packages LINES: install the packages of lines "package  # purpose", if no password is
+# needed: as root, or with sudo without password.
 install_packages() {
   local missing=$1 names sudo=()
   [[ -n $missing ]] || return 0
@@ -82,8 +82,8 @@ make_virtual_environment() {
 
 pip_install() { "$venv/bin/pip" install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
 
-# What decides whether an installed package is still the one in this folder. The Python files do
-# not: the install is editable.
+# Fingerprint of the files that require a new installation if they change. Python files are not
+# among them, because the installation is editable.
 fingerprint() {
   {
     find csrc setup.py pyproject.toml constraints.txt -type f -print0 | LC_ALL=C sort -z |
@@ -93,7 +93,7 @@ fingerprint() {
   } | sha256sum
 }
 
-# requirements EXTRA...: what pyproject.toml says that the package needs, with these extras.
+# requirements EXTRA...: print the package's requirements in pyproject.toml, with these extras.
 requirements() {
   "$venv/bin/python" - "$@" <<'PY'
 import sys
@@ -104,8 +104,8 @@ print(*project["dependencies"], *(name for e in sys.argv[1:] for name in extras[
 PY
 }
 
-# install_requirements EXTRA...: what the package needs, with these extras, but not the package:
-# nothing is compiled.
+# install_requirements EXTRA...: install the package's requirements, with these extras, but not the
+# package; nothing is compiled.
 install_requirements() {
   local now required=()
   now=$(cat pyproject.toml constraints.txt <("$venv/bin/python" -VV) <(echo "$*") | sha256sum)
@@ -117,14 +117,14 @@ install_requirements() {
   echo "$now" >"$venv/required"
 }
 
-# install_package EXTRA...: the package, editable, unless it is there and nothing has changed; then
-# the extras that are missing, which builds nothing.
+# install_package EXTRA...: install the package as editable, unless it is installed and unchanged;
+# then install only missing extras, without a build.
 install_package() {
   local extra now missing=() required=() stale='' switches=${CMAKE_ARGS:-}
   now=$(fingerprint)
   [[ $(cat "$venv/installed" 2>/dev/null) == "$now" ]] || stale=yes
   compgen -G 'diffcloth_torch/_core*.so' >/dev/null || stale=yes
-  # Tests call single kernels. Once built, they are built again with the rest.
+  # Tests call single kernels. Once built, the kernels are rebuilt with the rest.
   if [[ " $* " == *" test "* ]]; then
     compgen -G 'diffcloth_torch/_kernels*.so' >/dev/null || stale=yes
     switches+=" -DDIFFCLOTH_KERNELS=ON"
@@ -136,7 +136,7 @@ install_package() {
     say "Building the package and installing what it needs: a few minutes the first time"
     # The build's own requirements go into .venv, so that a second build compiles only what changed.
     pip_install setuptools cmake ninja nanobind cmeel-eigen
-    # The compiler needs the cores, pip the network and one core: both at once.
+    # The compiler needs the cores, pip the network and one core: run both at once.
     mkdir -p build
     CMAKE_ARGS=$switches PATH=$venv/bin:$PATH \
       "$venv/bin/python" setup.py --quiet build_ext >build/core.txt 2>&1 &
@@ -158,7 +158,7 @@ install_package() {
   done
   if ((${#missing[@]})); then
     say "Installing the extras ${missing[*]}"
-    # The name, not the folder: pip sees that the package is there.
+    # Use the name, not the folder, so that pip recognizes the installed package.
     pip_install "diffcloth-torch[$(
       IFS=,
       echo "${missing[*]}"

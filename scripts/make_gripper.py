@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Write diffcloth_torch/robots/gripper.urdf: a palm and two fingers that slide towards each other.
 
-At zero the fingers are open. All is even-density boxes; z points from the palm to the finger tips.
+At zero the fingers are open. All parts are boxes of uniform density; z points from the palm to the
+finger tips.
 """
 
 from __future__ import annotations
@@ -10,17 +11,17 @@ from pathlib import Path
 
 PATH = Path(__file__).resolve().parent.parent / "diffcloth_torch" / "robots" / "gripper.urdf"
 
-# Sizes along x, y, z [m] and masses [kg]. The pads are 2 cm wide, to hold the edge of a cloth of
-# some centimeters between vertices by two or three of them.
+# Sizes along x, y, z [m] and masses [kg]. The pads are 2 cm wide, to hold the edge of a cloth by
+# two or three of its vertices, some centimeters apart.
 PALM, PALM_MASS = (0.04, 0.13, 0.03), 0.4
 FINGER, FINGER_MASS = (0.02, 0.01, 0.05), 0.03
 OPENING = 0.08  # between the pads of open fingers [m]
-CLOSED = 0.001  # between those of closed ones: pads that are both prescribed never cross [m]
+CLOSED = 0.001  # between the pads of closed fingers: prescribed pads never cross [m]
 GAP = 0.001  # between palm and fingers [m]
 
 
 def numbers(*values: float) -> str:
-    """Write numbers as short as they are exact to 12 digits."""
+    """Write numbers in their shortest form that is exact to 12 digits."""
     return " ".join(f"{value:.12g}" for value in values)
 
 
@@ -45,7 +46,7 @@ def link(name: str, size: tuple[float, float, float], mass: float) -> str:
 
 
 def joint(side: str, sign: int) -> str:
-    """Make the joint of a finger on the side of y that has a sign; it closes as it grows."""
+    """Make the joint of a finger on the side of y with this sign; larger values close it."""
     y = sign * (OPENING + FINGER[1]) / 2
     return f"""\
   <joint name="{side}_finger_joint" type="prismatic">

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Write configs/meshes: a bell of cloth (OBJ, meters) and a skittle (PLY, centimeters, y up).
 
-They stand for meshes of your own in configs/drape_own.yaml. Both are surfaces of revolution whose
-rings have as many vertices as fit, so that triangles are of one size.
+The meshes represent meshes of your own in configs/drape_own.yaml. Both are surfaces of revolution
+whose rings have as many vertices as fit, so that triangles have similar sizes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FEWEST = 6  # vertices of a ring
 
 
 def resampled(profile: Sequence[tuple[float, float]], edge: float) -> Points:
-    """Points along a profile, its corners among them, at most an edge apart."""
+    """Points along a profile, including its corners, at most an edge apart."""
     corners = np.array(profile)
     points = [corners[:1]]
     for a, b in pairwise(corners):
@@ -41,12 +41,12 @@ def resampled(profile: Sequence[tuple[float, float]], edge: float) -> Points:
 
 
 def revolve(profile: Sequence[tuple[float, float]], edge: float) -> tuple[Points, Faces]:
-    """Surface of a profile that turns about z; it faces outward where the profile goes down."""
+    """Surface of revolution of a profile about z; faces point outward for a descending profile."""
     vertices, faces = [], []
     upper: list[int] = []
     for k, (radius, height) in enumerate(resampled(profile, edge)):
         count = 1 if radius == 0 else max(FEWEST, round(2 * np.pi * radius / edge))
-        # Every other ring is turned by half an edge.
+        # Every other ring is rotated by half an edge.
         angles = 2 * np.pi * (np.arange(count) + k % 2 / 2) / count
         lower = list(range(len(vertices), len(vertices) + count))
         vertices += [(radius * np.cos(t), radius * np.sin(t), height) for t in angles]
@@ -57,7 +57,7 @@ def revolve(profile: Sequence[tuple[float, float]], edge: float) -> tuple[Points
 
 
 def zipped(upper: Sequence[int], lower: Sequence[int]) -> Faces:
-    """Triangles between two rings: of the next vertices around, the nearer one is taken."""
+    """Triangles between two rings; the nearer of the two next vertices completes a triangle."""
     faces = []
     m, n = len(upper), len(lower)
     i = j = 0
@@ -92,7 +92,7 @@ def ply(vertices: Points, faces: Faces) -> str:
 
 
 def texts() -> dict[str, str]:
-    """Name of a file -> what is in it."""
+    """Map from the name of a file to its content."""
     skittle, faces = revolve(SKITTLE, SKITTLE_EDGE)
     x, y, z = skittle.T
     return {
