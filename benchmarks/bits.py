@@ -83,7 +83,7 @@ def digest(tensors: list[Tensor]) -> str:
 def measure(case: Case) -> tuple[str, str]:
     """Digests of the end, and of the gradients."""
     simulator, state, control = case.start()
-    # Whatever the scene has no use for is None.
+    # Parameters that the scene does not use are None.
     fields = {
         name: value.clone().requires_grad_()
         for name in dc.Parameters.__dataclass_fields__

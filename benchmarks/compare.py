@@ -198,7 +198,7 @@ def time_row(
             stack.callback(sides[-1].close)
         samples: tuple[list[dict[str, Any]], ...] = ([], [])
         for k in range(WARM_UP + steps):
-            # Who is first changes, as the first finds the caches of the second.
+            # Alternate the first side, which runs with the caches of the second.
             for i in (0, 1) if k % 2 == 0 else (1, 0):
                 sample = sides[i].step()
                 if k >= WARM_UP:

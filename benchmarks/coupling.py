@@ -89,7 +89,7 @@ def same_barrier(simulators: list[dc.Simulator]) -> list[dc.Simulator]:
 def timed(
     simulator: dc.Simulator, state: dc.State, control: dc.Control
 ) -> tuple[dc.State, float, float]:
-    """A step and its gradient, with the processor's times [ms]."""
+    """A step and its gradient, with their processor times [ms]."""
     generator = torch.Generator().manual_seed(0)
     start = state.replace(
         positions=state.positions.detach().requires_grad_(),

@@ -37,7 +37,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 @dataclass(frozen=True)
 class Experiment:
-    """A configuration, its assignments for zero friction, and those of its short form."""
+    """A configuration, its assignments for zero friction, and its assignments for a short form."""
 
     config: str
     frictionless: tuple[str, ...]

@@ -5,10 +5,10 @@
     python -m benchmarks.forward_peers --newton ../newton/bin/python --mujoco ../mujoco/bin/python
 
 The peers are Newton's Vertex Block Descent (`SolverVBD`) and MuJoCo's flex, each in a separate
-environment; all use one core, and processor time is counted. The scenes are those of
-`benchmarks.peers`, and a sheet whose upper half falls on the lower one, for 15 frames at 60 Hz with
-equal mesh, density, gravity, friction, and stiffness of stretch and bending, and with a contact
-radius of 1 mm in the peers. The docstrings of the workers list their settings and sources.
+environment; all use one core, and processor time is counted. The scenes of `benchmarks.peers`, and
+a sheet whose upper half falls on the lower one, run for 15 frames at 60 Hz with equal mesh,
+density, gravity, friction, and stiffness of stretch and bending, and with a contact radius of 1 mm
+in the peers. The docstrings of the workers list their settings and sources.
 Differences: the laws of stretch agree only for small strains; MuJoCo assigns equal masses to all
 vertices, and has damping; its mode `ipc` has no friction.
 

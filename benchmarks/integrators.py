@@ -82,7 +82,7 @@ def simulator(
 
 
 def print_momentum(n: int, seconds: float) -> None:
-    """Angular momentum that is left, and the change of the linear one."""
+    """Print the remaining angular momentum, and the change of linear momentum."""
     print(f"{'spin [rad/s]':<18}{'h [s]':>8}" + "".join(f"{name:>34}" for name in INTEGRATORS))
     rows: list[tuple[tuple[float, float, float], float]] = [
         ((0.0, 0.0, 5.0), 0.01),
@@ -301,7 +301,7 @@ def drop(seed: int, integrator: str, seconds: float) -> tuple[float, float, floa
     sim = dc.Simulator(scene, h, integrator=integrator, solver=dc.SolverOptions(throw=False))
     state = sim.initial_state()
     state = state.replace(velocities=state.velocities + velocities)
-    # From the lowest point that the scene allows.
+    # Heights count from the lowest point of the scene.
     lowest = -9.81 * float(sim.vertex_masses().sum()) * 0.8
     energies: list[tuple[float, float]] = []
     touched, steps = False, 0
