@@ -1,4 +1,4 @@
-"""Bodies against bodies: held apart everywhere, smoothly, whatever their triangles are."""
+"""Contact between bodies: smooth separation everywhere, for any triangulation."""
 
 import contact_scenes
 import ipctk

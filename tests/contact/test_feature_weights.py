@@ -1,4 +1,4 @@
-"""Contact with a body does not know how the body is cut into triangles."""
+"""Contact with a body does not depend on the body's triangulation."""
 
 import contact_scenes
 import numpy as np

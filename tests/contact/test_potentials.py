@@ -309,7 +309,7 @@ def test_friction_has_the_derivatives_of_its_energy(name, amount):
 @pytest.mark.parametrize("amount", [0.003, 0.05])
 @pytest.mark.parametrize("name", NAMES)
 def test_mixed_derivatives_of_friction(name, amount, angle):
-    """The frames of gaps turn, up to where a gap at the start is not made as long as at the lag."""
+    """Frames of gaps rotate, also by angles at which start gaps are not scaled to lagged ones."""
     scene = contact_scenes.make(name)
     if not scene.thickness:
         scene.thickness = parameter_of(scene, "thickness").tolist()
@@ -364,7 +364,7 @@ def test_tangents_are_mixed_derivatives_transposed(name):
 @pytest.mark.parametrize("amount", [0.003, 0.05])
 @pytest.mark.parametrize("name", NAMES)
 def test_tangents_of_friction_are_mixed_derivatives_transposed(name, amount, angle):
-    """The frames of gaps turn, up to where a gap at the start is not made as long as at the lag."""
+    """Frames of gaps rotate, also by angles at which start gaps are not scaled to lagged ones."""
     scene = contact_scenes.make(name)
     start, x = moved(scene, amount) @ rotation(angle, 3).T, moved(scene, amount, 6)
     for z in directions(scene.x.shape, 2, seed=8):

@@ -45,7 +45,7 @@ def make_scene(actuation="pd", gravity=(0, 0, -9.81), base="floating"):
 
 
 def raised(poses, row):
-    """With one body 1 cm higher."""
+    """Poses with one body 1 cm higher."""
     return poses.index_add(1, torch.tensor([row]), tensor([[[0, 0, 0.01, 0, 0, 0, 0]]]))
 
 
@@ -172,7 +172,7 @@ def roller(folder, base):
 
 
 def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
-    """Whatever the order of links in the file: the root turns about its own center of mass."""
+    """For any order of links in the file, the root turns about its own center of mass."""
     robot = roller(tmp_path, "floating")
     scene = dc.Scene([], [], [robot])
     assembly = assemble(scene)

@@ -207,7 +207,7 @@ def test_bad_mass_properties_are_refused(make, error, message):
 
 
 def _flat(height):
-    """A closed tetrahedron of next to no height."""
+    """A closed tetrahedron of nearly zero height."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, height]])
     return vertices, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 

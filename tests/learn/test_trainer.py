@@ -1,4 +1,4 @@
-"""Policies by gradients: the gradient, the critic's aims, checkpoints, and that they improve."""
+"""Policies by gradients: gradients, critic targets, checkpoints, and improvement of returns."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_forces_move_a_public_robot_under_a_cloth():
 @pytest.mark.slow
 @pytest.mark.parametrize(("package", "name"), QUICK)
 def test_meshes_are_where_pinocchio_places_them(package, name):
-    """Which files they are, their units, axes, scales and origins: the boxes of links agree."""
+    """Files, units, axes, scales and origins of meshes: the bounding boxes of links agree."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
     path = robot_file(package, name)
     robot = load(path, "position")
@@ -87,7 +87,7 @@ def test_meshes_are_where_pinocchio_places_them(package, name):
     for shape in geometry.geometryObjects:
         frame = model.frames[shape.parentFrame]
         if not hasattr(shape.geometry, "vertices"):
-            others.add(frame.name)  # boxes and the like, of which the tests of shapes know more
+            others.add(frame.name)  # primitive shapes, which other tests cover
             continue
         in_link = (frame.placement.inverse() * shape.placement).homogeneous
         vertices = np.array(shape.geometry.vertices())

@@ -62,7 +62,7 @@ def test_derivatives_of_environments_with_contacts_begin(uneven):
     with threads(1):
         values(simulator, state)
         assert places(simulator) == [*range(1, CHEAP + 1), 0]
-        # Nine losses of an environment are eight, and one.
+        # Nine losses of an environment are processed as eight and one.
         before = state.detach()
         x = before.positions.requires_grad_()
         after = simulator.step(before)

@@ -129,7 +129,7 @@ def test_iterations_of_projective_dynamics_are_bounded():
 
 @pytest.mark.parametrize("metric", ["elastic", None])
 def test_newtons_method_takes_what_its_iterations_do_not_solve(metric):
-    """Also without contact at nodes: their number was the end of a stiff sheet."""
+    """Newton also takes over without nodal contact; the iteration limit once ended such steps."""
     solver = {"max_iterations": 30}
     sim = simulator(SCENES["stiff"](), "projective", **solver)
     state, control = shaken(sim)

@@ -22,7 +22,7 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 
 @pytest.fixture(scope="module")
 def sim():
-    """Two cloths of two materials a free box, and a gripper that floats."""
+    """Two cloths of two materials, a free box, and a floating gripper."""
     first = dc.Cloth.grid(
         4,
         4,

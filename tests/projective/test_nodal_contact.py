@@ -277,7 +277,7 @@ def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
     torch.testing.assert_close(force.sum(), -weight, rtol=1e-6, atol=0)
     points = state.positions.clamp(-0.5, 0.5)
     center = force @ torch.tensor(floor.vertices) / force.sum()
-    # Vertices of the sheet weigh unlike each other.
+    # Vertices of the sheet have different weights.
     torch.testing.assert_close(center[:2], points.mean(0)[:2], rtol=0, atol=0.01)
 
 

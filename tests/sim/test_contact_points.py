@@ -63,7 +63,7 @@ def test_forces_add_up_to_those_of_the_report(step):
         between = contacts.pairs == torch.tensor([sim.surfaces.index(n) for n in (first, second)])
         rows = between.all(dim=-1)
         pressing = rows & (contacts.normal_forces != 0)
-        # Edges that are parallel to the last bit are counted, and press with nothing.
+        # Exactly parallel edges are counted, but have zero force.
         assert int(pressing.sum()) <= pairs[first, second].count <= int(rows.sum())
         assert pairs[first, second].count - int(pressing.sum()) <= 3
         if first != second:
@@ -82,7 +82,7 @@ def test_geometry_is_that_of_the_surfaces(step):
     assert (contacts.gaps[pressing] < sim.parameters().barrier_distance).all()
     assert float(distance[pressing].min()) == pytest.approx(state.report.minimum_distance, rel=1e-9)
     along = (contacts.tangential_forces * contacts.normals).sum(dim=-1).abs()
-    assert along.max() < 0.1 * contacts.forces.abs().max()  # of normals that are a solve old
+    assert along.max() < 0.1 * contacts.forces.abs().max()  # normals lag by one solve
 
 
 def test_points_lie_on_their_surfaces():

@@ -416,7 +416,7 @@ def test_slip_velocities_and_failures_of_others_change_no_bit():
 
 
 def test_environments_of_a_batch_are_those_alone():
-    """Friction settles within two steps in the first, and in eight in the second."""
+    """Friction settles within two steps in the first environment, in eight in the second."""
     sim = drape(rows=7)
     state = sim.initial_state(2)
     parameters = sim.parameters()

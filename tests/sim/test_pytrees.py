@@ -73,7 +73,7 @@ def test_a_control_is_a_tree_of_what_it_sets(simulator):
     assert torch.equal(moved.pins["edge"], state.positions[:3] + 0.002)
     found = torch.func.grad(lambda c: simulator.step(state, c).positions.sum())(control)
     assert found.pins["edge"].shape == (3, 3)
-    # Gradients are by each of several fields, as by one.
+    # Gradients are computed by each of several fields.
     assert found.wind.shape == (3,)
 
 

@@ -196,7 +196,7 @@ def test_a_batch_of_arms_has_the_bits_of_each(arm):
 
 
 def test_a_rollout_ends_at_the_equilibrium(arm):
-    """At any time step: velocity products of a fall had moved its end by the order of h squared."""
+    """For any time step h; velocity products of a fall once shifted the end by O(h^2)."""
     errors = []
     for dt in (0.02, 0.01):
         robot = arm(stiffness=4.0, damping=0.5)

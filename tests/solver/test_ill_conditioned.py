@@ -42,7 +42,7 @@ def net(n, *, stretch):
 
 
 SCENES = {
-    # A pivot is negative by rounding, and by much.
+    # A pivot is clearly negative, due to rounding.
     "slivers": lambda: slivers(200),
     # A pivot is too small.
     "stiff": lambda: net(16, stretch=1e6),
@@ -68,7 +68,7 @@ def test_cloth_takes_hardly_any():
     state = simulator.initial_state()
     for _ in range(3):
         state = simulator.step(state)
-        assert state.report.counts["in_doubles"] <= 1  # whether the first was right
+        assert state.report.counts["in_doubles"] <= 1  # at most one check of the first factor
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_differences(name):
     loss(velocities).backward()
     direction = torch.randn(start.shape, generator=torch.Generator().manual_seed(3)).double()
     with torch.no_grad():
-        # The stiff net buckles after more.
+        # The stiff net buckles after larger changes.
         size = 1e-5 if name == "stiff" else 1e-3
         expected = difference(lambda v: loss(v).item(), start, direction, size)
     found = (velocities.grad * direction).sum().item()
@@ -93,7 +93,7 @@ def test_gradients_are_those_of_differences(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_factors_that_are_made_again_are_the_same(name):
-    """In whatever precision they are."""
+    """Remade factors are equal in either precision."""
     simulator = SCENES[name]()
     gradients = []
     for forgets in (False, True):

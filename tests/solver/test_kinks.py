@@ -1,4 +1,4 @@
-"""Kinks of friction: at a small slip velocity its energy is as good as |w|."""
+"""Kinks of friction: at a small slip velocity its energy is nearly |w|."""
 
 import importlib
 from pathlib import Path

@@ -14,7 +14,7 @@ NO_TIME = 1e-9  # [s] over before the first iteration
 
 
 def falling(n=5, schemes=None, **solver):
-    """A sheet that falls onto a box and overlaps its edge."""
+    """A sheet that falls onto a box and overhangs its edges."""
     sheet = dc.Cloth.grid(n, n, 0.2, pose=[0, 0, 0.06, 1, 0.03, 0, 0])
     box = dc.RigidBody.box(0.1)
     options = schemes or {}

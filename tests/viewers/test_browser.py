@@ -23,7 +23,7 @@ from diffcloth_torch.viewers.layers import colors, strain
 
 pytest.importorskip("viser")
 
-# viser's own, which nobody here can mend.
+# Warnings of viser itself, which cannot be fixed here.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 CHROMIUM = next(
