@@ -1,1 +1,1 @@
-"""What a step costs: see `python -m benchmarks.step --help`."""
+"""Benchmarks: see `python -m benchmarks.step --help` for the cost of a step."""

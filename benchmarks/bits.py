@@ -1,11 +1,11 @@
-"""Digests of steps and gradients: where two versions print the same lines, the bits are the same.
+"""Digests of steps and gradients: equal lines of two versions mean equal bits.
 
     python -m benchmarks.bits > before.txt       # ten seconds; in another checkout > after.txt
     diff before.txt after.txt
 
 Every scene of `benchmarks/scenes.py`, a free body and a gripper, in each scheme and coupling that
-takes them, alone and in a batch. A line has digests of all tensors of the state after some steps,
-and of the gradients by the start and by every parameter.
+supports them, alone and in a batch. A line has digests of all tensors of the state after some
+steps, and of the gradients by the start and by every parameter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PROJECTIVE = ("hanging", "stiff", "plane", "sphere", "air")
 
 @dataclass(frozen=True)
 class Case:
-    """A regime, and how it gets there."""
+    """A regime, and a function that makes its simulator, start and control."""
 
     name: str
     start: Callable[[], tuple[dc.Simulator, dc.State, Callable[[dc.State], dc.Control]]]
@@ -72,7 +72,7 @@ def cases(size: int) -> Iterator[Case]:
 
 
 def digest(tensors: list[Tensor]) -> str:
-    """Of shapes and bits."""
+    """Digest of the shapes and bits of tensors."""
     sha = hashlib.sha256()
     for tensor in tensors:
         sha.update(str(tuple(tensor.shape)).encode())
@@ -83,7 +83,7 @@ def digest(tensors: list[Tensor]) -> str:
 def measure(case: Case) -> tuple[str, str]:
     """Digests of the end, and of the gradients."""
     simulator, state, control = case.start()
-    # Whatever the scene has no use for is None.
+    # Parameters that the scene does not use are None.
     fields = {
         name: value.clone().requires_grad_()
         for name in dc.Parameters.__dataclass_fields__

@@ -1,4 +1,4 @@
-"""Count the steps that end elsewhere when their start differs by next to nothing.
+"""Count steps that end in another minimum after a tiny change of their start.
 
     python -m benchmarks.branches                                       # minutes
     python -m benchmarks.branches --scene sphere --size 24 --starts 8
@@ -6,18 +6,18 @@
     python -m benchmarks.branches --keep FOLDER     # later runs count on the same trajectories
     python -m benchmarks.branches --quick                               # seconds
 
-Where cloth buckles a step has several minima. Which one it ends in shall be a function of its start
-that does not flip with the last bits: gradients, optimizers and differences all rest on that. So
-the states of a trajectory are recorded, and each is stepped again from starts whose vertices differ
-at random, all by the same size, which is drawn between `--least` and `--most` for each start. In
-`held-or-moved` the starts are equal, and a body that is held still in one moves by that size in the
-other. A jump is an end with a vertex more than 0.1 mm away from where the recorded start ends.
-Ordinary ends differ by a few times what their starts do (`growth`, the median).
+A step of buckling cloth has several minima. The choice of the minimum must not depend on the last
+bits of the start: gradients, optimizers and differences rely on this. Therefore the states of a
+trajectory are recorded, and each is stepped again from starts with random changes of all vertices.
+The size of the change is drawn between `--least` and `--most` for each start. In `held-or-moved`
+the starts are equal, and a body that is static in one run moves by that size in the other. A jump
+is an end with a vertex more than 0.1 mm away from the end of the recorded start. Ordinary ends
+differ by a few times the difference of their starts (`growth`, the median).
 
-jumps       starts that end elsewhere, of all
-failed      of these and of the recorded states, those whose step does not converge; none is a jump
-iterations  mean of the recorded states' steps, of all their solves
-time        mean of the core's, of the same steps, on one thread [ms]
+jumps       starts that end in another minimum, of all
+failed      changed starts and recorded states whose step does not converge; none is a jump
+iterations  mean over the steps of the recorded states, summed over their solves
+time        mean time of the core for these steps, on one thread [ms]
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ FIELDS = ("positions", "velocities", "body_poses")
 
 @dataclass(frozen=True)
 class Trial:
-    """A scene, and how it is stepped.
+    """A scene and the options of its steps.
 
     Attributes:
-        scene: By the number of vertices a side.
+        scene: Function from the number of vertices per side to a scene.
         dt: Time step [s].
-        tolerance: Of the solver [m/s].
-        nudged: Whether the ends of the bodies' motions differ, instead of the starts of the cloths.
+        tolerance: Tolerance of the solver [m/s].
+        nudged: If true, the ends of the bodies' motions differ instead of the cloths' starts.
     """
 
     scene: Callable[[int], Scene]
@@ -64,7 +64,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Count:
-    """One row of the table; see above."""
+    """One row of the table; the module's docstring explains the columns."""
 
     scene: str
     size: int
@@ -157,7 +157,7 @@ def main(
 
 
 def record(simulator: dc.Simulator, scene: Scene, steps: int, kept: Path | None) -> list[dc.State]:
-    """The states of a trajectory, from its regime on: of the file `kept`, or written to it."""
+    """The states of a trajectory in its regime, read from the file `kept` or written to it."""
     start = simulator.initial_state()
     if kept is not None and kept.exists():
         return [start.replace(**fields) for fields in torch.load(kept, weights_only=True)]
@@ -170,7 +170,7 @@ def record(simulator: dc.Simulator, scene: Scene, steps: int, kept: Path | None)
 
 
 def nudged(state: dc.State, shift: torch.Tensor) -> dc.Control:
-    """Move the bodies from where they are by next to nothing [m]."""
+    """A control that moves the bodies by a tiny shift [m]."""
     poses = state.body_poses.clone()
     poses[:, :3] += shift
     return dc.Control(body_poses=poses)
@@ -184,7 +184,7 @@ def count_jumps(
     range_of_sizes: tuple[float, float],
     kept: Path | None = None,
 ) -> Count:
-    """Step the states of a trajectory again, from starts beside them [m]."""
+    """Step the states of a trajectory again, from starts at distances in `range_of_sizes` [m]."""
     trial = TRIALS[name]
     scene = trial.scene(size)
     simulator = trial.simulator(scene)
@@ -199,7 +199,7 @@ def count_jumps(
             seconds.append(float(sum(end.report.seconds.values())))
             failed += not end.report.converged
             for _ in range(starts):
-                # All that a start draws, whatever becomes of it: others do not depend on that.
+                # Every start draws equally many numbers, so other starts do not depend on its end.
                 distance = np.exp(random.uniform(*np.log(range_of_sizes)))
                 noise = torch.from_numpy(random.uniform(-1, 1, tuple(state.positions.shape)))
                 if trial.nudged:

@@ -3,10 +3,10 @@
     python -m benchmarks.compare --against ../other
     python -m benchmarks.compare --against ../other --scene sphere --size 24 --size 48
 
-`--against` is a folder that holds a built package `diffcloth_torch`: another checkout, or the
-site-packages of another environment. The two live in processes of their own, pinned to the same
-core, and take their steps in turn, so that what slows the machine slows both. Each follows its own
-trajectory from the same start, where this checkout's approach ends, as models of contact may differ
+`--against` is a folder with a built package `diffcloth_torch`: another checkout, or the
+site-packages of another environment. The two run in separate processes, pinned to one core, and
+step alternately, so that other load of the machine slows both. Both start at the end of this
+checkout's approach; then each follows its own trajectory, because models of contact may differ
 between versions.
 
 Times are medians in milliseconds per environment, the ratio is other over this: above 1, this
@@ -44,7 +44,7 @@ WARM_UP = 2  # steps whose times are dropped: caches fill
 
 @dataclass(frozen=True)
 class Row:
-    """What is timed."""
+    """One timed configuration."""
 
     scene: str
     size: int
@@ -54,13 +54,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Medians:
-    """Of one side.
+    """Medians of one side.
 
     Attributes:
-        forward: Of a step, per environment [ms].
-        backward: Likewise, of the steps that converged; None where none did.
+        forward: Time of a step per environment [ms].
+        backward: Time of backward for converged steps, per environment [ms]; None without any.
         iterations: Newton iterations of a step.
-        unconverged: Environment steps that did not converge, of all timed.
+        unconverged: Number of timed environment steps that did not converge.
     """
 
     forward: float
@@ -116,7 +116,7 @@ class Side:
         self._process.stdout.close()
 
     def _send(self, line: str) -> None:
-        # A side that has failed says why when its answer is missing.
+        # A side that has failed reports its reason when its answer is read.
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(line + "\n")
             self._process.stdin.flush()
@@ -187,9 +187,9 @@ def time_row(
     processor_time: bool,
     slip_velocity: float | None = None,
 ) -> tuple[Medians, Medians]:
-    """Medians of this checkout and of the other, which take their steps in turn.
+    """Medians of this checkout and of the other, which step alternately.
 
-    Both start where this checkout's approach ends, which the folder `kept` keeps.
+    Both start at the end of this checkout's approach, which the folder `kept` stores.
     """
     with contextlib.ExitStack() as stack:
         sides = []
@@ -198,7 +198,7 @@ def time_row(
             stack.callback(sides[-1].close)
         samples: tuple[list[dict[str, Any]], ...] = ([], [])
         for k in range(WARM_UP + steps):
-            # Who is first changes, as the first finds the caches of the second.
+            # Alternate the first side, which runs with the caches of the second.
             for i in (0, 1) if k % 2 == 0 else (1, 0):
                 sample = sides[i].step()
                 if k >= WARM_UP:
@@ -226,7 +226,7 @@ def _line(row: Row, ours: Medians, theirs: Medians) -> str:
 
 
 def _number(value: float | None) -> str:
-    """Three digits, or all those before the point."""
+    """A number with three significant digits, or all digits before the point."""
     if value is None:
         return "-"
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

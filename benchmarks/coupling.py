@@ -1,12 +1,12 @@
-"""What it costs that a body or a gripper moves by forces: `monolithic` beside prescribed motion.
+"""Cost of bodies and grippers that forces move: `monolithic` beside prescribed motion.
 
     python -m benchmarks.coupling            # a minute or two
     python -m benchmarks.coupling --quick    # seconds, on small meshes
 
-A free body falls on a sheet, or a floating gripper with driven fingers. Every step is taken again
-from the same state with the body, or the robot, on the poses that it has just had: the same problem
-with its coordinates given. Both are timed in turn; times are of the processor
-[ms], medians over the steps in contact. Backward is of a random loss of positions.
+A free body, or a floating gripper with driven fingers, falls on a sheet. Every step is repeated
+from the same state with the resulting poses prescribed: the same problem with known coordinates.
+Both are timed alternately; values are processor times [ms], medians over the steps in contact.
+Backward is of a random loss of positions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DT = 0.01  # [s]
 
 @dataclass(frozen=True)
 class Pair:
-    """Two simulators of one scene, and what the steps of the first one are."""
+    """Two simulators of one scene: free motion, and its replay as prescribed motion."""
 
     free: dc.Simulator
     given: dc.Simulator
@@ -54,8 +54,8 @@ def body(size: int) -> Pair:
 
 
 def gripper(size: int, **bounds: float) -> Pair:
-    """A hand on a floating base whose palm comes down on the sheet while its fingers close."""
-    # Turned over: its fingers point down, and end 1 cm above the sheet.
+    """A hand on a floating base: its palm falls on the sheet while its fingers close."""
+    # Turned over: the fingers point down, and end 1 cm above the sheet.
     options = {"pose": [0.013, 0.007, 0.1, 0, 1, 0, 0], "name": "hand", **bounds}
     robots = [
         dc.Robot.load(dc.robots.GRIPPER, base="floating", stiffness=200.0, damping=5.0, **options),
@@ -72,7 +72,7 @@ def gripper(size: int, **bounds: float) -> Pair:
 
 
 def limited_gripper(size: int) -> Pair:
-    """The same with friction, and drives at the limits of their efforts and speeds."""
+    """The gripper with joint friction, and drives at the limits of their efforts and speeds."""
     return gripper(size, effort_limits=2.0, velocity_limits=0.05, joint_friction=0.2)
 
 
@@ -80,7 +80,7 @@ PAIRS = {"free body": body, "gripper": gripper}
 
 
 def same_barrier(simulators: list[dc.Simulator]) -> list[dc.Simulator]:
-    """Give both the stiffest barrier that a pair of the first has, for its free bodies."""
+    """Both simulators with the largest barrier stiffness of the first, due to its free bodies."""
     stiffness = float(simulators[0].default_parameters().barrier_stiffness.max())
     contact = dc.ContactOptions(barrier_stiffness=stiffness)
     return [dc.Simulator(simulator.scene, DT, contact=contact) for simulator in simulators]
@@ -89,7 +89,7 @@ def same_barrier(simulators: list[dc.Simulator]) -> list[dc.Simulator]:
 def timed(
     simulator: dc.Simulator, state: dc.State, control: dc.Control
 ) -> tuple[dc.State, float, float]:
-    """A step and its gradient, with the processor's times [ms]."""
+    """A step and its gradient, with their processor times [ms]."""
     generator = torch.Generator().manual_seed(0)
     start = state.replace(
         positions=state.positions.detach().requires_grad_(),

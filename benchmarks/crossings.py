@@ -1,4 +1,4 @@
-"""How many pairs of triangles intersect in a state, by the predicates of the IPC Toolkit."""
+"""Number of intersecting pairs of triangles in a state, by the predicates of the IPC Toolkit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Crossings:
         faces = [s.faces + start for s, start in zip(surfaces, starts[:-1], strict=True)]
         self._faces = np.concatenate(faces).astype(np.int32)
         self._edges = ipctk.edges(self._faces)
-        # The bodies of a scene are prescribed: where they overlap each other is nobody's doing.
+        # Overlaps between bodies do not count, because the bodies of a scene are prescribed.
         is_rigid = np.arange(starts[-1]) >= starts[len(scene.cloths)]
         self._is_rigid = is_rigid[self._faces[:, 0]]
         patches = np.where(is_rigid, starts[-1], np.arange(starts[-1])).astype(np.int32)
@@ -47,7 +47,7 @@ class Crossings:
         return self.count_points(self.points(state))
 
     def count_points(self, points: NDArray[np.float64]) -> int:
-        """The same where the vertices of cloths, then bodies, are there."""
+        """Number of intersecting pairs for these vertices of cloths, then bodies."""
         mesh = ipctk.CollisionMesh(points, self._edges, self._faces)
         mesh.can_collide = self._can_collide
         if not ipctk.has_intersections(mesh, points):

@@ -3,18 +3,18 @@
     python -m benchmarks.drape_coefficient
     python -m benchmarks.drape_coefficient --quick     # seconds: shows that it runs
 
-A disk of cloth, 30 cm wide, lies on a pedestal of 18 cm that holds its middle, and hangs over the
-rim. The drape coefficient is the area of its shadow beyond the pedestal, as a part of that of the
+A disk of cloth, 30 cm wide, lies on a pedestal of 18 cm, which holds its middle, and hangs over the
+rim. The drape coefficient is the area of its shadow beyond the pedestal, divided by the area of the
 flat ring: 100 % for a stiff plate. The disk falls for `--seconds`, with five bending stiffnesses,
-without friction and with it. `simulator.equilibrium` starts from the rollout after `--fold`
-seconds, when the folds have formed, and from the flat disk; with friction also from the rollout's
-end, which anchors friction where the rollout has come to.
+with and without friction. `simulator.equilibrium` starts from the rollout after `--fold` seconds,
+when the folds have formed, and from the flat disk; with friction also from the end of the rollout,
+which anchors friction there.
 
 Columns: bending stiffness [mJ]; drape coefficient at the end of the rollout [%]; largest distance
-of a vertex from there to the equilibrium found from the folds, from the flat disk and from the end
-[m]; speed at the end of the rollout [m/s]; processor time of the rollout [s]; that of the
-equilibrium from the folds as a part of it, and that of the first call of a simulator, which also
-makes its engines.
+of a vertex at that end to the equilibria found from the folds, from the flat disk and from the end
+[m]; speed at the end of the rollout [m/s]; processor time of the rollout [s]; processor time of the
+equilibrium from the folds, relative to the rollout, and of the first call of a simulator, which
+includes the construction of its engines.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Drape(NamedTuple):
     rim: int
 
     def coefficient(self, state: dc.State) -> float:
-        """Area of the shadow beyond the pedestal, as a part of that of the flat ring."""
+        """Area of the shadow beyond the pedestal, divided by the area of the flat ring."""
         x, y = state.positions[: self.rim, :2].T.numpy()
         shadow = 0.5 * abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
         pedestal = np.pi * PEDESTAL**2

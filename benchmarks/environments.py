@@ -1,4 +1,4 @@
-"""Environments for learning: transitions a second, and returns of policies made by hand."""
+"""Environments for learning: transitions per second, and returns of handmade policies."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from diffcloth_torch.sim.solve import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
 POLICIES = ("zero", "random", "scripted", "replayed")
-_MARKS = "<!-- returns -->\n", "<!-- end of returns -->\n"  # of the table on a page
-_SEEDS = 1000, 2000  # of the episodes, and of the one that is replayed
+_MARKS = "<!-- returns -->\n", "<!-- end of returns -->\n"  # around the table on a page
+_SEEDS = 1000, 2000  # seeds of the evaluated episodes and of the replayed one
 _WARM_UP = 4  # transitions: pickers close
 
 
@@ -57,10 +57,10 @@ def main(
     FoldCloth by default, and for --returns all tasks. With gradients, the sum of the rewards of ten
     steps at a time is differentiated by the actions. Memory is the largest of the process so far.
 
-    Rates are by what processors do, so that other programs do not count: seconds outside of the
-    core, and of those in the core the part of one thread. `python` is the share of the former, and
-    `waiting` how much longer it took than that, in shares of the time that passed: threads that
-    wait for the last of them, and for other programs.
+    Rates use processor time, which excludes other programs: time outside of the core, plus the
+    core's time divided by the threads. `python` is the share outside of the core. `waiting` is the
+    share of wall-clock time beyond this sum: threads that wait for the last one, or for other
+    programs.
     """
     if returns:
         print_returns(tasks or tuple(envs.TASKS), episodes, size, page)
@@ -86,8 +86,8 @@ def main(
 def _forward(
     env: envs.ClothVectorEnv, script: Sequence[torch.Tensor]
 ) -> tuple[float, float, float]:
-    """Steps a second, the share of Python in the time that is needed, and that of waiting."""
-    in_core = 0.0  # of this thread, in calls of the core
+    """Steps per second, the share of Python in the required time, and the share of waiting."""
+    in_core = 0.0  # time of this thread in calls of the core [s]
     call = core_step._forward
 
     def timed(*given: Any, **named: Any) -> Any:
@@ -112,9 +112,9 @@ def _forward(
 
 
 def _backward(env: envs.ClothVectorEnv, script: Sequence[torch.Tensor], python: float) -> float:
-    """Steps a second with the gradient of the rewards of ten at a time.
+    """Steps per second with the gradient of the rewards of ten steps at a time.
 
-    The share of Python is taken to be that of steps without gradients.
+    The share of Python is assumed to equal the share of steps without gradients.
     """
     start = time.process_time()
     for first in range(0, len(script), 10):
@@ -124,13 +124,13 @@ def _backward(env: envs.ClothVectorEnv, script: Sequence[torch.Tensor], python: 
         torch.autograd.grad(total, leaves)
     env.clear_grad()
     spent = time.process_time() - start
-    # Of a second that is needed, all threads spend this: what is in the core counts for each.
+    # Processor time per required second: time in the core counts for each thread.
     threads = min(torch.get_num_threads(), env.num_envs)
     return len(script) * (python + (1 - python) * threads) / spent
 
 
 def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], envs.EnvState]:
-    """Scripted actions, and where they begin; the environments are there again."""
+    """Scripted actions and their start, to which the environments are reset."""
     env.reset(seed=0)
     with torch.no_grad():
         for _ in range(_WARM_UP):
@@ -147,8 +147,8 @@ def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], e
 def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | None = None) -> None:
     """Print mean returns and success rates [%] of zero, random, scripted and replayed policies.
 
-    Intervals are Wilson's, at 95 %. With a page the rows are written there, too: between the
-    lines that begin and end with `_MARKS`, where the row of a task replaces the former one.
+    Intervals are Wilson's, at 95 %. With a page the rows are also written there, between the lines
+    `_MARKS`, where the row of a task replaces the former one.
     """
     print("| task | " + " | ".join(POLICIES) + " |")
     print("|---" * (1 + len(POLICIES)) + "|")

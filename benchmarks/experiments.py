@@ -1,15 +1,15 @@
-"""The experiments of the paper's section V.B by scheme: who gets through without intersecting?
+"""The experiments of the paper's section V.B by scheme: results and intersections.
 
     python -m benchmarks.experiments                       # minutes
     python -m benchmarks.experiments --pictures docs/images
     python -m benchmarks.experiments --quick               # seconds, on small meshes
 
-Each row is one run of configs/tie.yaml or configs/cloth_on_cube.yaml. `pairs` counts pairs of
-triangles that intersect, as the IPC Toolkit finds them: the most in a state, and `states` in how
-many states there are any. `stuck` counts steps that did not converge, or after which nothing was
-possible any more. `distance` is how far the control points are from their targets in the end, the
-farthest of them, `stretch` how long an edge is in the worst state, over its length at rest. `turns`
-is how often the ends of a strip are wound around each other in the end. Times are of the processor.
+Each row is one run of configs/tie.yaml or configs/cloth_on_cube.yaml. `pairs` is the largest number
+of intersecting pairs of triangles in a state, as found by the IPC Toolkit; `states` is the number
+of states with any. `stuck` counts steps that did not converge, or after which the run could not
+continue. `distance` is the largest final distance of a control point from its target, `stretch` the
+largest length of an edge over its length at rest, over all states. `turns` is the final number of
+turns of a strip's ends around each other. Times are processor times.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 @dataclass(frozen=True)
 class Experiment:
-    """A configuration, what makes its friction vanish, and its short form."""
+    """A configuration, its assignments for zero friction, and its assignments for a short form."""
 
     config: str
     frictionless: tuple[str, ...]
@@ -81,7 +81,7 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """What came of one configuration; the attributes are the columns of the table."""
+    """Results of one configuration; the attributes are the columns of the table."""
 
     states: list[dc.State]
     pairs: list[int]
@@ -165,9 +165,9 @@ def stretch(scene: dc.Scene, state: dc.State) -> float:
 
 
 def turns(task: ControlPoints, state: dc.State) -> float | None:
-    """Turns of the ends of the first cloth around each other; None where that is no strip.
+    """Turns of the ends of the first cloth around each other; None if the cloth is no strip.
 
-    Its middle line is cut at the middle of the bend.
+    The strip's middle line is cut at the middle of the bend.
     """
     shape = task.config.scene.cloths[0].shape
     if shape.kind != "strip":
@@ -181,9 +181,9 @@ def turns(task: ControlPoints, state: dc.State) -> float | None:
 def linking(a: np.ndarray, b: np.ndarray) -> float:
     """The linking integral of Gauss of two polygons, [n, 3] and [m, 3].
 
-    A whole number if both are closed; about the number of turns where two ends are wound around
-    each other. The directions from points of one segment to points of another cover a solid angle,
-    that of a quadrilateral whose corners are the directions between their ends.
+    The result is an integer if both are closed, and approximately the number of turns for two ends
+    wound around each other. The directions from points of one segment to points of another cover
+    the solid angle of a quadrilateral whose corners are the directions between their ends.
 
     References:
         Klenin and Langowski, Computation of writhe in modeling of supercoiled DNA, 2000, method 1a.

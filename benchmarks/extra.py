@@ -1,4 +1,4 @@
-"""What the benchmarks need beyond the package."""
+"""Packages that the benchmarks need beyond the package's own requirements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HINTS = {
 
 
 def require(module: str) -> Any:
-    """Import a module, or end the process with a sentence that says what to install."""
+    """Import a module, or end the process with a sentence that names the package to install."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

@@ -4,14 +4,13 @@
     python -m benchmarks.factorization --size 24 --seconds 3
     python -m benchmarks.factorization --quick           # seconds
 
-Matrices are M / h^2 plus projected elastic Hessians (`hanging`), and the same with a layer of
-contacts (`self-contact`). Backends and the levels of our own kernels take turns on one matrix, so
-that whatever else the machine does falls on all of them. Times are of the processor, medians, and
-for the factorization also the least [ms]. CHOLMOD is there
-if the core was built with `DIFFCLOTH_CHOLMOD=ON`, and is as fast as the BLAS that it finds:
-OpenBLAS may need `OPENBLAS_CORETYPE` to see a new processor. Ours is timed in single precision,
-which the solver uses, and in doubles. Below each matrix: the share of each phase of our
-factorization in doubles at its best level.
+Matrices are M / h^2 plus projected elastic Hessians (`hanging`), and such matrices with a layer of
+contacts (`self-contact`). Backends and the levels of our own kernels alternate on one matrix, so
+that other load of the machine affects all of them. Times are medians of processor times, for the
+factorization also the minimum [ms]. CHOLMOD is included if the core was built with
+`DIFFCLOTH_CHOLMOD=ON`, and is as fast as its BLAS: OpenBLAS may need `OPENBLAS_CORETYPE` to
+recognize a new processor. Ours is timed in single precision, which the solver uses, and in doubles.
+Below each matrix: the share of each phase of our factorization in doubles at its best level.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ from benchmarks.hessians import HESSIANS, Hessian
 _kernels = require("diffcloth_torch._kernels")
 
 SIZES = (24, 48, 96, 200)
-BURST = 3  # calls in a row: the first one finds its memory in no cache
-LARGEST_ELSEWHERE = 96  # beyond it only our own factorization is timed
+BURST = 3  # consecutive calls: the first one has its memory in no cache
+LARGEST_ELSEWHERE = 96  # beyond this size only our own factorization is timed
 
 
 @dataclass(frozen=True)
 class Method:
-    """A backend, and the instructions of its kernels where there is a choice."""
+    """A backend, and the level of its kernels' instructions if there is a choice."""
 
     backend: str
     level: str = ""
@@ -61,7 +60,7 @@ def methods() -> list[Method]:
 
 
 class Trial:
-    """One method on one matrix, with the times of its three parts."""
+    """One method on one matrix, with the times of analysis, factorization and solve."""
 
     def __init__(self, method: Method, matrix: Hessian) -> None:
         self.method = method
@@ -84,7 +83,7 @@ class Trial:
         return self.factor.profile(self.matrix.blocks, self.workspace, repeats)
 
     def _analyze(self):
-        """With an empty factor, for which the analysis is finished."""
+        """The analysis, and an empty factor, whose construction completes the analysis."""
         m = self.matrix
         analysis = _kernels.CholeskyAnalysis(
             m.size, m.pairs, m.fixed, self.method.backend, self.method.level

@@ -2,20 +2,20 @@
 
     python -m benchmarks.figures --against "the first version=../first"
     python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
-    python -m benchmarks.figures --forward-peers NEWTON MUJOCO    # these peers alone, again
-    python -m benchmarks.figures --environments "the first version=../first"    # these alone, again
-    python -m benchmarks.figures --draw    # the page alone, again
+    python -m benchmarks.figures --forward-peers NEWTON MUJOCO    # repeat only these peers
+    python -m benchmarks.figures --environments "the first version=../first"    # repeat only these
+    python -m benchmarks.figures --draw    # redraw only the page
 
 `--against` names another checkout with a built package, and may be repeated: all scenes are timed
 with it and this checkout side by side, as by `benchmarks.compare`. Then this checkout alone is
 timed by phases, as by `benchmarks.step`, and with several losses in one backward. `--newton` is the
-Python of an environment with Newton, which is timed beside us as by `benchmarks.peers`. What was
-measured is in docs/performance.json, of which page and plots are made. `--forward-peers` times
-what `benchmarks.forward_peers` does, with the Pythons of its two environments, and `--environments`
-what `benchmarks.scripted` does; both leave the rest of the records as it is.
+Python of an environment with Newton, which is timed beside this package as by `benchmarks.peers`.
+Measurements are stored in docs/performance.json, from which page and plots are made.
+`--forward-peers` repeats the measurements of `benchmarks.forward_peers`, with the Pythons of its
+two environments, and `--environments` those by `benchmarks.scripted`; both keep all other records.
 
-`--cpu` counts processor time, on a machine that others use too; then threads are left out, as
-processor time says nothing of them.
+`--cpu` counts processor time, for a shared machine; threads are then omitted, because processor
+time does not show their benefit.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ RECORDS = "performance.json"
 SIZES = (12, 24, 48)
 PHASE_SIZES = (24, 48)
 BUCKLING_SIZE = 24
-STEPS = {12: 12, 24: 12, 48: 4}  # timed, after those of the warm-up
+STEPS = {12: 12, 24: 12, 48: 4}  # number of timed steps by size, after the warm-up
 BATCH_SCENES = ("hanging", "sphere")
 LOSSES = (1, 8, 64)
 LOSS_SCENES = ("hanging", "sphere", "self-contact")
@@ -142,9 +142,9 @@ def _folders(others: Iterable[str]) -> dict[str, Path]:
 def measure(
     others: dict[str, Path], newton: Path | None, cpu: bool, quick: bool, kept: Path
 ) -> Records:
-    """Everything that the page says, as plain numbers.
+    """All measurements of the page, as plain numbers.
 
-    The folder `kept` keeps each scene's regime, as the way there takes longer than what is timed.
+    The folder `kept` stores each scene's regime, because the approach takes longer than the timing.
     """
     sizes, phase_sizes = ((6,), (6,)) if quick else (SIZES, PHASE_SIZES)
     names = BATCH_SCENES if quick else tuple(SCENES)
@@ -198,7 +198,7 @@ def measure(
 
 
 def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
-    """What `benchmarks.forward_peers` says, and when."""
+    """Measurements of `benchmarks.forward_peers`, with date and processor."""
     torch.set_num_threads(1)
     return {
         "date": date.today().isoformat(),
@@ -287,7 +287,7 @@ def _time_shared(name: str, size: int, kept: Path) -> Records:
 
 
 def draw_all(records: Records, folder: Path) -> list[tuple[str, str]]:
-    """Draw the plots; their files and what they show."""
+    """Draw the plots; return their files and captions."""
     import matplotlib as mpl
 
     mpl.use("svg")
@@ -379,7 +379,7 @@ def _save(figure: Any, file: Path) -> None:
 
     figure.savefig(file, metadata={"Date": None})
     plt.close(figure)
-    # Trailing blanks are what some editors and hooks take away.
+    # Remove trailing blanks, as some editors and hooks do.
     lines = file.read_text().splitlines()
     file.write_text("\n".join(line.rstrip() for line in lines) + "\n")
 
@@ -538,9 +538,9 @@ def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) ->
     """Two times and their ratio.
 
     Args:
-        rows: Each with the labels, which come first, and the two times.
-        labels: Keys, and what stands above them.
-        pair: Keys of the two, and what stands above them.
+        rows: Records with the labels and the two times.
+        labels: Keys of the first columns, and their headings.
+        pair: Keys of the two times, and their headings.
     """
     lines = []
     for r in rows:
@@ -596,7 +596,7 @@ def _table(head: list[str], rows: list[list[Any]]) -> str:
 
 
 def _is(row: Records, size: int) -> bool:
-    """Whether a row is of one environment in an ordinary scene of this size."""
+    """Return whether a row is of one environment in an ordinary scene of this size."""
     return row["size"] == size and not row["batch"] and row["scene"] in SCENES
 
 
@@ -605,13 +605,13 @@ def _sizes(rows: list[Records]) -> list[int]:
 
 
 def _ratio(row: Records, part: str) -> float | None:
-    """Time of the other over that of this; None where a side has none."""
+    """Time of the other side divided by this side's; None if a side has no time."""
     ours, theirs = row["this"][part], row["other"][part]
     return theirs / ours if ours and theirs else None
 
 
 def _number(value: float | None) -> str:
-    """Three digits, or all those before the point."""
+    """A number with three significant digits, or all digits before the point."""
     if value is None:
         return "-"
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

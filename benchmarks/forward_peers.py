@@ -4,16 +4,16 @@
     python -m venv ../mujoco && ../mujoco/bin/pip install mujoco
     python -m benchmarks.forward_peers --newton ../newton/bin/python --mujoco ../mujoco/bin/python
 
-The peers are Newton's Vertex Block Descent (`SolverVBD`) and MuJoCo's flex, each in an environment
-of its own; all use one core, and processor time is counted. The scenes of `benchmarks.peers`, and a
-sheet whose upper half falls on the lower one, go on for 15 frames at 60 Hz with the same mesh,
+The peers are Newton's Vertex Block Descent (`SolverVBD`) and MuJoCo's flex, each in a separate
+environment; all use one core, and processor time is counted. The scenes of `benchmarks.peers`, and
+a sheet whose upper half falls on the lower one, run for 15 frames at 60 Hz with equal mesh,
 density, gravity, friction, and stiffness of stretch and bending, and with a contact radius of 1 mm
-in the peers. Their workers say which settings they take, and where from. What differs: the laws of
-stretch agree for small strains only; MuJoCo gives all vertices the same mass, and damps; its mode
-`ipc` has no friction.
+in the peers. The docstrings of the workers list their settings and sources.
+Differences: the laws of stretch agree only for small strains; MuJoCo assigns equal masses to all
+vertices, and has damping; its mode `ipc` has no friction.
 
-Crossings are pairs of triangles of the sheet that intersect, vertices inside are those within the
-body, both the most of any frame. `stretch` is the longest edge over its length at rest.
+Crossings are intersecting pairs of triangles of the sheet, vertices inside are vertices within the
+body, both the maximum over frames. `stretch` is the longest edge over its length at rest.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from benchmarks.crossings import Crossings
 from benchmarks.scenes import self_contact
 
 SCENES = (*peers.SCENES, "self-contact")
-FOLDING = ("sphere", "self-contact")  # where MuJoCo looks for contact of the sheet with itself
-RADIUS = 1e-3  # of contact in the peers [m]
+FOLDING = ("sphere", "self-contact")  # scenes for which MuJoCo detects self-contact of the sheet
+RADIUS = 1e-3  # contact radius in the peers [m]
 
 Records = dict[str, Any]
 
 
 def scene(name: str, size: int) -> Records:
-    """What all are told: plain numbers."""
+    """The scene for all simulators, as plain numbers."""
     if name == "self-contact":
         told = peers.scene("hanging", size)
         cloth = self_contact(size).scene.cloths[0]
@@ -137,7 +137,7 @@ def judge(told: Records, found: Records) -> Records:
 
 
 def time_all(newton: Path, mujoco: Path, size: int) -> Iterator[Records]:
-    """A row for each scene and each simulator, as they come."""
+    """Yield one row for each scene and simulator."""
     for name in SCENES:
         told = scene(name, size)
         runs = [

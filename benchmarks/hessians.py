@@ -1,4 +1,4 @@
-"""The matrices whose factorization is timed: Hessians of sheets with and without contact."""
+"""Matrices of the factorization benchmark: Hessians of sheets with and without contact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits of what is known, with many seeds of the noise: are the true values in the intervals?
+"""Fits of known values with many seeds of the noise: coverage of the confidence intervals.
 
     python -m benchmarks.identification
     python -m benchmarks.identification --seeds 2 configs/fit_cantilever.yaml
@@ -7,17 +7,17 @@
     python -m benchmarks.identification --places          # ten starts: do they end at one place?
     python -m benchmarks.identification --set scene.cloths.disk.shape.edge_length=0.014 ...
 
-Each configuration makes observations of its own on a finer mesh, with half the time step and noise
-of 1 mm, and is fitted with ten seeds of this noise, from its first values. Printed for each number
-that is fitted: the true value, the median of what is found, the median half width of the intervals
-of 95 %, the bias without noise, which is what mesh and time step do, and in how many seeds the
-interval holds the true value, with the interval of 95 % of this share (Clopper and Pearson), and
-the share that the bias leaves: with noise alone it would be 95 %. Above them stand the median root
-mean square of the residuals, in units of the noise, and of the processor time.
+Each configuration makes synthetic observations on a finer mesh, with half the time step and noise
+of 1 mm, and is fitted with ten seeds of this noise, from its first values. For each fitted number
+the columns are: the true value, the median fitted value, the median half width of the 95 %
+intervals, the bias without noise (due to mesh and time step), the number of seeds whose interval
+contains the true value, with the 95 % interval of this share (Clopper and Pearson), and the share
+expected with this bias: without bias it would be 95 %. The line above has the median root mean
+square of the residuals, in units of the noise, and the median processor time.
 
 With `--compare`, columns are evaluations of the residuals (an evaluation of a Jacobian by tangents
 counts as one, its processor time is in the seconds), processor time [s], final cost over the lowest
-one of all ways, and the largest error of a number relative to its true value [%].
+cost of all methods, and the largest error of a number relative to its true value [%].
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.tasks.registry import read_config
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-QUIET = 1e-6  # noise [m] that shows what mesh and time step do
+QUIET = 1e-6  # noise [m] small enough to show the error of mesh and time step
 ADAM_STEPS, ADAM_RATE = 100, 0.05
 CMA_EVALUATIONS, CMA_SPREAD = 400, 0.3
 
@@ -54,7 +54,7 @@ class Found(NamedTuple):
     seconds: float
 
     def numbers(self) -> dict[str, tuple[float, float]]:
-        """Name of each number -> what was found, and the true value."""
+        """Name of each number -> fitted value and true value."""
         truth = self.task.config.fit.trajectories[0].synthetic.values
         pairs = {}
         for name in dict.fromkeys(n.partition("[")[0] for n in self.fit.names):
@@ -82,7 +82,7 @@ def fit(task: Any, **options: Any) -> Found:
 
 
 def coverage(config: Path, first: int, seeds: int, changes: tuple[str, ...]) -> Iterator[str]:
-    """Rows of what was found with each seed of the noise."""
+    """Rows of the results over all seeds of the noise."""
     quiet = fit(load(config, 0, QUIET, *changes), starts=1).numbers()
     runs = [
         fit(load(config, seed, None, *changes), starts=1)
@@ -104,7 +104,7 @@ def coverage(config: Path, first: int, seeds: int, changes: tuple[str, ...]) -> 
 
 
 def shares(inside: int, seeds: int) -> str:
-    """A count, and the interval of 95 % of the probability behind it."""
+    """A count, and the 95 % interval of the underlying probability."""
     from scipy.stats import binomtest
 
     low, high = binomtest(inside, seeds).proportion_ci()
@@ -112,9 +112,9 @@ def shares(inside: int, seeds: int) -> str:
 
 
 def biased_share(bias: float, half_width: float) -> float:
-    """Probability that an interval of 95 % holds the truth, from which its middle is `bias` away.
+    """Probability that a 95 % interval contains the truth if its middle has this bias.
 
-    Of a normal law, whose interval reaches 1.96 standard deviations.
+    For a normal distribution, whose interval reaches 1.96 standard deviations.
     """
     from scipy.stats import norm
 
@@ -123,7 +123,7 @@ def biased_share(bias: float, half_width: float) -> float:
 
 
 def places(config: Path, seeds: int, changes: tuple[str, ...]) -> Iterator[str]:
-    """How many starts end at the best place: the first values, and random ones."""
+    """Count the starts (first values and random ones) that end at the best point."""
     task = load(config, 0, None, *changes)
     numbers = len(Space(task.variables()))
     yield f"\n{config.stem}: {numbers} numbers, {len(task.observed)} trajectories"
@@ -149,7 +149,7 @@ class _Counted:
         try:
             return 0.5 * float((self.residuals(theta) ** 2).sum())
         except SimulationError:
-            return float("inf")  # the solver rejects it
+            return float("inf")  # the solver rejects the trial point
 
     def loss(self, theta: torch.Tensor) -> torch.Tensor:
         self.count += 1

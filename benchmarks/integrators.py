@@ -1,6 +1,6 @@
 """Compare the integrators: momentum, bias of fits by the time step, energy in contact, and cost.
 
-    python -m benchmarks.integrators              # all of it: about twenty minutes
+    python -m benchmarks.integrators              # all parts: about twenty minutes
     python -m benchmarks.integrators --part momentum --part drag
     python -m benchmarks.integrators --quick      # small forms of each part
 
@@ -9,7 +9,7 @@ Parts:
 momentum   Share of its angular momentum that a free sheet keeps in a second, by its spin and by the
            time step, and the change of its linear momentum.
 drag       A sheet swings from one edge in air. Error of its positions by the time step against the
-           second-order step with h / 16, and the drag that a fit to those finds.
+           second-order step with h / 16, and the drag that a fit to these positions finds.
 explicit   The same sheet against an explicit solver of SciPy (DOP853) for the same energies.
 damping    A sheet oscillates about its hanging shape; damping that a fit to data of h / 16 finds.
 drops      Random sheets fall on bodies and on themselves: the largest energy after contact over the
@@ -62,7 +62,7 @@ def main(parts: Sequence[str], scenes: int, quick: bool) -> None:
 
 
 def sheet(n: int, side: float = 0.5, **material: float) -> dc.Cloth:
-    """A sheet whose vertices are off a regular grid."""
+    """A sheet on a jittered grid."""
     grid = dc.Cloth.grid(n, n, side)
     vertices = np.array(grid.vertices)
     vertices[:, :2] += np.random.default_rng(0).uniform(-0.01, 0.01, (n * n, 2)) * side
@@ -82,7 +82,7 @@ def simulator(
 
 
 def print_momentum(n: int, seconds: float) -> None:
-    """Angular momentum that is left, and the change of the linear one."""
+    """Print the remaining angular momentum, and the change of linear momentum."""
     print(f"{'spin [rad/s]':<18}{'h [s]':>8}" + "".join(f"{name:>34}" for name in INTEGRATORS))
     rows: list[tuple[tuple[float, float, float], float]] = [
         ((0.0, 0.0, 5.0), 0.01),
@@ -142,7 +142,7 @@ def rms(a: Tensor, b: Tensor) -> float:
 
 
 def found(residual: Callable[[float], float], low: float, high: float) -> float:
-    """Where a residual is least."""
+    """Argument of the smallest residual."""
     from scipy.optimize import minimize_scalar
 
     options = {"maxiter": 12, "xatol": 1e-3 * (high - low)}
@@ -301,7 +301,7 @@ def drop(seed: int, integrator: str, seconds: float) -> tuple[float, float, floa
     sim = dc.Simulator(scene, h, integrator=integrator, solver=dc.SolverOptions(throw=False))
     state = sim.initial_state()
     state = state.replace(velocities=state.velocities + velocities)
-    # From the lowest point that the scene allows.
+    # Heights count from the lowest point of the scene.
     lowest = -9.81 * float(sim.vertex_masses().sum()) * 0.8
     energies: list[tuple[float, float]] = []
     touched, steps = False, 0

@@ -25,10 +25,10 @@ from diffcloth_torch.learn import Trainer, TrainerOptions
 
 @dataclass(frozen=True)
 class Job:
-    """A task: its configuration, vertices a side, and environment steps of a run.
+    """A task: its configuration, vertices per side, and environment steps of a run.
 
     Attributes:
-        free_steps: Of PPO and SAC, which need more.
+        free_steps: Environment steps of PPO and SAC, which need more.
     """
 
     config: str
@@ -38,17 +38,17 @@ class Job:
 
 
 JOBS = {
-    # An odd size: a row of vertices lies where the fold shall be, or nobody succeeds.
+    # An odd size, so that a row of vertices lies on the fold line; otherwise no policy succeeds.
     "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 10_000),
     "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
     "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
 }
 FIRST_ORDER, FREE = ("planned", "apg", "shac", "sapo"), ("ppo", "sac")
 ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
-# Of FoldCloth alone: a plan with hard grasps, APG with gradients through what it sees, and a
-# planned policy with one scale for each tensor.
+# Variants for FoldCloth only: a plan with hard grasps, APG with gradients through observations, and
+# a planned policy with one scale for each tensor.
 VARIANTS = ("hard", "feedback", "scaled")
-# Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
+# Options for all tasks: APG uses whole episodes, the others halves with a critic's final value.
 COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "init_std": 0.05, "target_entropy": -2.0}
 APG: dict[str, Any] = {"discount": 1.0, "learning_rate": 4e-3}
 PLANNED: dict[str, Any] = APG | {
@@ -94,16 +94,17 @@ def main(
     plot: Path | None,
     only_show: bool,
 ) -> None:
-    """Train with each algorithm and seed, and evaluate without noise on the way.
+    """Train with each algorithm and seed, and evaluate without noise during training.
 
-    `plan` is no policy: it optimizes the actions of one episode, whose return it is. `planned` is
-    APG whose policy is a plan, a linear function of what it sees, and a network; `apg` has the
-    network alone. `scripted` is the policy made by hand. FoldCloth has three more: `hard`, a plan
-    with hard grasps, `feedback`, APG with gradients through what it sees, and `scaled`, `planned`
-    with the scale "tensor". A file keeps what was run, and a run that it has is not made again.
+    `plan` is no policy: it optimizes the actions of one episode and reports its return. `planned`
+    is APG with a policy that consists of a plan, a linear function of the observation and a
+    network; `apg` has only the network. `scripted` is the handmade policy. FoldCloth has three
+    more: `hard`, a plan with hard grasps, `feedback`, APG with gradients through observations, and
+    `scaled`, `planned` with the scale "tensor". A file stores completed runs, which are not
+    repeated.
 
-    Prints the median over seeds of the best mean return, how many environment steps and seconds
-    of one core each needed to reach the best that PPO reached, and the share of successes at the
+    Prints the median over seeds of the best mean return, the environment steps and seconds of one
+    core that each algorithm needed to reach PPO's best return, and the share of successes at the
     end. The time of evaluations does not count.
     """
     runs: list[dict[str, Any]] = []
@@ -130,7 +131,7 @@ def main(
 
 
 def _document(runs: Sequence[dict[str, Any]]) -> str:
-    """One run a line, in a fixed order."""
+    """JSON text with one run per line, in a fixed order."""
     order = (*ALGORITHMS, *VARIANTS)
     rows = sorted(runs, key=lambda r: (r["task"], order.index(r["algorithm"]), r["seed"]))
     return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
@@ -175,7 +176,7 @@ def _run(work: tuple[str, str, int, float, int]) -> dict[str, Any]:
     make = partial(envs.make, task, **given)
     first = document["trainer"].get("first_action")
     steps = round(share * (job.free_steps if algorithm in FREE else job.steps))
-    # More of them at first, where much changes; none after the last.
+    # Evaluations are denser at first, when returns change most; none follows the last.
     due = [steps * (k / (evaluations - 1)) ** 2 for k in range(evaluations)] + [math.inf]
     if algorithm == "scripted":
         curve = _scripted(make)
@@ -271,7 +272,7 @@ class _Curve:
     """Returns of evaluations; their own time does not count."""
 
     def __init__(self, make: Callable[..., Any], act: Callable[[torch.Tensor], Any] | None) -> None:
-        """Evaluate a policy, or the one that was made by hand."""
+        """Evaluate the policy `act`, or the handmade one for None."""
         self.points: list[dict[str, float]] = []
         self._env, self._act = make(num_envs=EPISODES), act
         self._start = time.process_time()
@@ -308,8 +309,8 @@ def _free(
 ) -> list[dict[str, float]]:
     """PPO or SAC from the same first action.
 
-    Their options are the usual ones, but that PPO learns every 256 steps, with less noise at first:
-    with 2048 and a deviation of 1 it learns nothing in so few steps.
+    Options have their usual values, except that PPO learns every 256 steps and starts with less
+    noise: with 2048 steps and a deviation of 1 it learns nothing in so few steps.
     """
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.callbacks import BaseCallback

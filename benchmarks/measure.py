@@ -1,4 +1,4 @@
-"""Times of steps, forward and backward, and of the reference factorization beside them."""
+"""Times of steps, forward and backward, and of a reference factorization between steps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ except ModuleNotFoundError:  # in the first version, which we compare with
 
 ipctk = require("ipctk")
 
-REPEATS = 5  # of the derivatives of one step, after one whose times are dropped
+REPEATS = 5  # repetitions of the derivatives of one step, after one untimed repetition
 MANY = 8  # directions
 BLOCK = 5  # steps between two reference factorizations
 WARM_UP = 2  # steps with backward whose times are dropped: caches fill
@@ -50,19 +50,19 @@ class Timing:
     """One row of the table; times are per environment.
 
     Attributes:
-        scene: Its name.
+        scene: Name of the scene.
         size: Vertices along a side.
-        batch: Environments, 0 for a state without a batch axis.
-        threads: Of torch.
-        steps: Timed steps.
-        forward: Of one step [ms].
-        backward: Of one step [ms].
-        reference: One Eigen LDL^T factorization of the contact-free Hessian, EF [ms].
-        tangent: Time of one tangent over that of one backward, both of the core, of the last step.
-        many_tangents: The same of `MANY` tangents at once.
-        phases: Medians of the phases that the report of a step gives [ms].
+        batch: Number of environments, 0 for a state without a batch axis.
+        threads: Number of threads of torch.
+        steps: Number of timed steps.
+        forward: Time of one step [ms].
+        backward: Time of backward of one step [ms].
+        reference: Time of one Eigen LDL^T factorization of the contact-free Hessian, EF [ms].
+        tangent: Time of one tangent over the time of one backward, both in the core, last step.
+        many_tangents: Time of `MANY` tangents at once over the time of one backward.
+        phases: Medians of the phases in the report of a step [ms].
         iterations: Median Newton iterations of a step.
-        residual: Largest of all steps [m/s].
+        residual: Largest residual of all steps [m/s].
         contacts: Median number of pairs in contact.
         contact_share: Median share of the vertices that are in contact [-].
     """
@@ -106,10 +106,10 @@ def time_steps(
     scene: Scene,
     kept: Path | None = None,
 ) -> Timing:
-    """Bring a scene into its regime and time steps from there on, each with its backward.
+    """Bring a scene into its regime and time the following steps, each with its backward.
 
-    The gradient is that of positions and velocities, with respect to those before the step and to
-    the targets of the bodies. The file `kept` is that of `in_regime`.
+    Positions and velocities are differentiated by positions and velocities before the step and by
+    the targets of the bodies. The file `kept` is passed to `in_regime`.
     """
     simulator = dc.Simulator(scene.scene, DT)
     repeats = 3 if size <= 24 else 1
@@ -162,9 +162,10 @@ def reference_seconds(simulator: dc.Simulator, state: dc.State, repeats: int) ->
 def tangent_ratios(
     simulator: dc.Simulator, state: dc.State, control: dc.Control
 ) -> tuple[float, float]:
-    """Time of one tangent and of `MANY` at once, relative to a backward, all asked of the core.
+    """Time of one tangent and of `MANY` at once, relative to one backward, all in the core.
 
-    Of positions and velocities, by those before the step and the targets of the bodies.
+    Positions and velocities are differentiated by positions and velocities before the step and by
+    the targets of the bodies.
     """
     with torch.no_grad():
         given, _ = simulator._inputs(state.detach(), control, None)
@@ -239,7 +240,7 @@ def _timed_step(
 
 
 def contact_share(simulator: dc.Simulator, state: dc.State) -> float:
-    """Share of the cloth's vertices that belong to a pair in contact, as ipctk finds them [-]."""
+    """Share of the cloth's vertices that belong to a pair in contact, as found by ipctk [-]."""
     faces, vertices = [], [state.positions.numpy()]
     start = 0
     for cloth in simulator.scene.cloths:

@@ -1,12 +1,12 @@
 """One scene with MuJoCo's flex, forward.
 
-`benchmarks.forward_peers` runs this file as a script, in the environment that has MuJoCo, and tells
-it a scene as JSON. It needs nothing of ours, so that the two need not live in one environment.
+`benchmarks.forward_peers` runs this file as a script in the environment with MuJoCo, and passes a
+scene as JSON. The script does not import this package, so the two may be in separate environments.
 
-Settings are those that MuJoCo's documentation recommends for cloth (Modeling, Deformables): the
-integrator `discrete` with steps of about 2 ms, Newton's method with a tolerance of 1e-6, elasticity
-of a shell, and damping of 2 ms, the least of the recommended range. `ipc` asks for its mode without
-intersections, which has no friction.
+Settings follow MuJoCo's documentation for cloth (Modeling, Deformables): the integrator `discrete`
+with steps of about 2 ms, Newton's method with a tolerance of 1e-6, elasticity of a shell, and
+damping of 2 ms, the minimum of the recommended range. `ipc` selects the mode without intersections,
+which has no friction.
 """
 
 from __future__ import annotations

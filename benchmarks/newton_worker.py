@@ -1,11 +1,10 @@
 """One scene with Newton's differentiable cloth (`newton` 1.x on `warp`), on the processor.
 
-`benchmarks.peers` runs this file as a script, in the environment that has Newton, and tells it a
-scene as JSON. It needs nothing of ours, so that the two need not live in one environment.
+`benchmarks.peers` runs this file as a script in the environment with Newton, and passes a scene as
+JSON. The script does not import this package, so the two may be in separate environments.
 
-Newton's `SolverSemiImplicit` is the one of its solvers of cloth that differentiates: explicit
-substeps, forces of triangles and hinges, and penalties where a particle meets a shape. It
-calculates in single precision.
+`SolverSemiImplicit` is Newton's only differentiable cloth solver: explicit substeps, forces of
+triangles and hinges, and penalties for contact of particles with shapes, in single precision.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class Rollout:
         self.weights = wp.array(np.array(scene["weights"]), dtype=wp.vec3)
 
     def forward(self, velocities: np.ndarray) -> wp.array:
-        """The loss after all frames from these velocities."""
+        """Loss after all frames for these initial velocities."""
         self.states[0].particle_qd.assign(velocities.astype(np.float32))
         for k in range(self.count):
             self.states[k].clear_forces()
@@ -131,7 +130,7 @@ def stable_substeps(scene: dict[str, Any]) -> int:
         rollout = Rollout(scene, substeps)
         rollout.forward(np.array(scene["velocities"]))
         frames = [rollout.positions(k, substeps) for k in range(1, scene["frames"] + 1)]
-        if all((lengths(x) < LONGEST * rest).all() for x in frames):  # false where not a number
+        if all((lengths(x) < LONGEST * rest).all() for x in frames):  # false for NaN
             return substeps
         substeps *= 2
     raise SystemExit(f"unstable with {MOST_SUBSTEPS} substeps")

@@ -3,14 +3,14 @@
     python -m venv ../peer && ../peer/bin/pip install newton
     python -m benchmarks.peers --newton ../peer/bin/python
 
-The peer is Newton, in an environment of its own; both use one core, and processor time is counted.
-A sheet of 1 m hangs by two corners, slides on a floor, or drops on a sphere, 15 frames at 60 Hz;
-the loss is where its center is in the end. Newton's cloth takes explicit substeps, the least power
-of two that stretches no edge by half its length, and its material has another law with the same
+The peer is Newton, in a separate environment; both use one core, and processor time is counted. A
+sheet of 1 m hangs by two corners, slides on a floor, or drops on a sphere, 15 frames at 60 Hz; the
+loss is the final position of its center. Newton's cloth uses explicit substeps, the smallest power
+of two for which no edge is stretched by half its length, and a different material law with the same
 modulus: the two solve the same problem, but not the same equations. Each gradient is compared with
-differences of its own loss, along three translations and a turn of the initial velocities. The
-error is that of the worst direction, at the best of several steps of the difference, relative to
-the largest slope.
+differences of its own loss, along three translations and a rotation of the initial velocities. The
+error is the error of the worst direction, at the best of several difference steps, relative to the
+largest slope.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ DT = 1 / 60  # [s]
 FRAMES = 15
 REPEATS = 3
 DIFFERENCE_STEPS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # of velocities [m/s]
-SINGLE_DIFFERENCE_STEPS = (1e-1, 3e-2, 1e-2, 3e-3)  # in single precision
+SINGLE_DIFFERENCE_STEPS = (1e-1, 3e-2, 1e-2, 3e-3)  # difference steps in single precision
 MATERIAL = dc.Material(friction=0.4)
-CONTACT_DAMPING = 0.1  # of the peer's penalty [N s/m]: a third of critical, one vertex on it
+CONTACT_DAMPING = 0.1  # of the peer's penalty [N s/m]: a third of critical for one vertex
 RADIUS = 0.2  # of the sphere [m]
 WORKER = "newton_worker.py"
 
@@ -47,7 +47,7 @@ Records = dict[str, Any]
 
 
 def scene(name: str, size: int) -> Records:
-    """What both are told: plain numbers."""
+    """The scene for both simulators, as plain numbers."""
     vertices, faces = sheet(size)
     vertices[:, 2] += 0.1 / (size - 1)
     velocities = np.zeros_like(vertices)
@@ -162,7 +162,7 @@ def time_ours(told: Records) -> Records:
 
 
 def time_peer(told: Records, python: Path, worker: str) -> Records:
-    """The same by a peer, in its own environment, on one core."""
+    """Results of a peer for the scene `told`, in its own environment, on one core."""
     core = min(os.sched_getaffinity(0))
     result = subprocess.run(
         [python, str(Path(__file__).with_name(worker))],
@@ -178,13 +178,13 @@ def time_peer(told: Records, python: Path, worker: str) -> Records:
 
 
 def gradient_error(found: Records) -> float:
-    """Of the slopes in all directions, relative to the largest: at the best step of each."""
+    """Largest error of a slope at its best difference step, relative to the largest slope."""
     slopes, differences = np.array(found["slopes"]), np.array(found["differences"])
     return float(np.abs(differences - slopes[:, None]).min(axis=1).max() / np.abs(slopes).max())
 
 
 def depth(told: Records, found: Records) -> float:
-    """How far the sheet was below the surface of the body, at its deepest in any frame [m]."""
+    """Largest depth of the sheet below the surface of the body over all frames [m]."""
     body, faces = told["body"], np.array(told["faces"])
     if body is None:
         return 0.0
@@ -203,7 +203,7 @@ def depth(told: Records, found: Records) -> float:
 
 
 def time_all(newton: Path, size: int) -> Iterator[Records]:
-    """A row for each scene and each of the two, as they come."""
+    """Yield one row for each scene and each of the two simulators."""
     for name in SCENES:
         told = scene(name, size)
         for who, found in (("ours", time_ours(told)), ("Newton", time_peer(told, newton, WORKER))):

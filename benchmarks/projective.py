@@ -1,13 +1,12 @@
-"""What a step of the baseline costs: a sheet that slides off a sphere in dry friction at its nodes.
+"""Cost of a step of the baseline: a sheet slides off a sphere with dry friction at its nodes.
 
     python -m benchmarks.projective            # under a minute
     python -m benchmarks.projective --quick    # seconds, on a small mesh
 
 25 x 25 vertices, 4.5 m wide, on a sphere of radius 2 m, in steps of 1/180 s: the scene of the
-reference trajectory that the tests compare with. Each row is one way to solve the elastic stage, to
-one tolerance. The fastest of the steps in contact, in milliseconds and in EF: one factorization of
-the contact-free Hessian by Eigen, the fastest of those in between. Backward is of a random loss of
-positions.
+tests' reference trajectory. Each row is one elastic solver at one tolerance. Times are of the
+fastest step in contact, in milliseconds and in EF: one factorization of the contact-free Hessian by
+Eigen, the fastest of those between the steps. Backward is of a random loss of positions.
 """
 
 from __future__ import annotations

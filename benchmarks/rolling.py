@@ -1,4 +1,4 @@
-"""Round bodies and their meshes down an incline: how far from rolling, and at which price.
+"""Round bodies and their meshes down an incline: deviation from rolling, and cost.
 
     python -m benchmarks.rolling
     python -m benchmarks.rolling --quick     # seconds: shows that it runs
@@ -39,7 +39,7 @@ def rotation_about(axis: str, degrees: float) -> Tensor:
 
 
 class Shape(NamedTuple):
-    """A body from its keywords, and its moment of inertia about y as it starts over m r^2."""
+    """A function that makes a body, and its moment of inertia about y at the start over m r^2."""
 
     make: Callable[..., dc.RigidBody]
     moment: float
@@ -79,7 +79,7 @@ SHAPES = {
 
 
 def roll(shape: Shape, distance: float, seconds: float, dt: float) -> tuple[int, float, float]:
-    """Faces of a body, its speed over that of a round one, minus one, and seconds of a step."""
+    """Number of faces, speed over a round body's speed minus one, and seconds of a step."""
     slope = rotation_about("y", math.degrees(ANGLE))
     downhill, _, normal = rotate(slope, torch.eye(3, dtype=slope.dtype))
     at = normal * (RADIUS + distance / 2)

@@ -1,4 +1,4 @@
-"""What workers cost, and what they bring: updates of a policy here, in processes and on Ray."""
+"""Cost and speedup of workers: updates of a policy in this process, in processes and on Ray."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ HOLD = (0.0, 0.0, 0.2, 0.95, 0.0, 0.0, 0.2, 0.95)
 @click.option("--workers", default=2, show_default=True, type=click.IntRange(1))
 @click.option("--ray/--no-ray", default=True, help="Whether to start Ray.")
 def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bool) -> None:
-    """Time updates of APG on FoldCloth, 16 steps a rollout, and what is sent for one.
+    """Time updates of APG on FoldCloth, 16 steps per rollout, and the messages of an update.
 
-    The same updates everywhere; the first is left out, in which workers start. `of n` is how many
-    times as fast they are as here, one core each, by the time that passes. `on idle cores` is the
-    same by what processors do: C / (S + C / n), where C is what an update takes here and S what the
-    trainer itself does while workers make it. At the end: how long an update would take with more
-    workers of one chunk each, if the messages of all pass through the trainer one by one.
+    All kinds of workers make equal updates; the first update, in which workers start, is omitted.
+    `of n` is the speedup over this process with one core per worker, by wall-clock time. `on idle
+    cores` is the speedup by processor time: C / (S + C / n), where C is the time of an update here
+    and S the trainer's own time during an update by workers. At the end: the time of an update with
+    more workers of one chunk each, if all messages pass through the trainer one by one.
     """
     torch.set_num_threads(1)
     make = partial(envs.make, "FoldCloth", size=size, opens_at=-1.0, reach=0.06)
@@ -51,7 +51,7 @@ def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bo
         print(f"Ray started in {time.perf_counter() - start:.1f} s")
     made = [(name, kind, trainer(kind)) for name, kind in kinds]
     times: dict[str, list[tuple[float, float]]] = {name: [] for name, _ in kinds}
-    # Side by side: what else runs on the machine slows all of them.
+    # Alternate between kinds, so that other load of the machine slows all of them.
     for k in range(updates + 1):
         for name, _, one in made:
             start, start_of_core = time.perf_counter(), time.process_time()
@@ -84,7 +84,7 @@ def _bits(trainer: Trainer) -> str:
 
 
 def _messages(trainer: Trainer, chunk_seconds: float) -> None:
-    """Sizes and times of what is sent, and what follows for more workers."""
+    """Print sizes and times of messages, and the extrapolation to more workers."""
     pieces: list[Piece] = trainer._pieces()
     piece, result = pieces[0], roll_out(trainer._env, pieces[0])
     seconds = 0.0

@@ -1,12 +1,12 @@
-"""The scenes that are timed: a square sheet of 1 m, and what it meets.
+"""Scenes of the benchmarks: a square sheet of 1 m, with bodies, robots or other sheets.
 
-Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
-takes steps that bring it into its regime before anything is timed. `SCENES` are the ordinary ones;
-in `BUCKLING` cloth buckles in many places at once, which costs many iterations; those of `FURTHER`
-have a potential, a body, or a robot, that the others lack. The stiffnesses of `woven-sphere` differ
-so little from each other that its steps are those of `sphere`: what they take longer is the cost of
-the orthotropic kernels. Older versions that `benchmarks.compare` times know `rest_positions` of
-cloths by its earlier name only.
+Sheets are jittered in their plane, because exact grids are at kinks of the contact energy. Each
+scene approaches its regime in untimed steps. `SCENES` are the ordinary ones; in `BUCKLING` cloth
+buckles in many places at once, which requires many iterations; scenes of `FURTHER` have a
+potential, a body or a robot that the others lack. The stiffnesses of `woven-sphere` differ so
+little from each other that its steps equal the steps of `sphere`: the additional time is the cost
+of the orthotropic kernels. Older versions timed by `benchmarks.compare` know `rest_positions` of
+cloths only by its earlier name.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ TURN = 2 * np.pi  # of the ends of a sheet that is twisted [rad/s]
 
 @dataclass(frozen=True)
 class Scene:
-    """What is timed.
+    """A benchmark scene with its start and motion.
 
     Attributes:
         scene: Cloth and bodies.
-        approach: Steps until the regime is reached.
-        speed: Of the cloth at the start [m/s].
-        body_speed: Of the bodies, throughout [m/s].
-        carry: From the vertices to the velocities [m/s] of those that are pinned; none rest.
-        joint_target: Of the drives of all joints [m]; None without a robot.
+        approach: Number of steps until the regime is reached.
+        speed: Velocity of the cloth at the start [m/s].
+        body_speed: Constant velocity of the bodies [m/s].
+        carry: Function from pinned vertices to their velocities [m/s]; None: pins rest.
+        joint_target: Target of the drives of all joints [m]; None without a robot.
     """
 
     scene: dc.Scene
@@ -46,7 +46,7 @@ class Scene:
     joint_target: float | None = None
 
     def control(self, state: dc.State) -> dc.Control:
-        """Move pins and bodies on by one step; new leaves, so that gradients stop there."""
+        """Control that moves pins and bodies by one step, in new leaves without history."""
         if self.joint_target is not None:
             return dc.Control(
                 joint_positions=torch.full_like(state.joint_positions, self.joint_target)
@@ -102,7 +102,7 @@ def damped(n: int) -> Scene:
 
 
 def stiff(n: int) -> Scene:
-    """Hang upright by two corners, so stiff that the sheet buckles: free of contact."""
+    """Hang upright by two corners without contact, so stiff that the sheet buckles."""
     pins = {"corners": [n * (n - 1), n * n - 1]}
     cloth = _upright(n, pins=pins, material=dc.Material(stretch=1e4))
     return Scene(dc.Scene([cloth]), approach=10)
@@ -122,7 +122,7 @@ def sphere(
     material: dc.Material = dc.Material(),  # noqa: B008  # immutable
     **shape: bool,
 ) -> Scene:
-    """Drape over a sphere: a part of the vertices in contact, folds between them."""
+    """Drape over a sphere: some vertices are in contact, with folds between them."""
     vertices, faces = sheet(n)
     vertices += (0.02, 0.03, _gap(n))
     ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -0.2, 1, 0, 0, 0], **shape)
@@ -131,7 +131,7 @@ def sphere(
 
 
 def smooth_sphere(n: int) -> Scene:
-    """The same over the analytic surface."""
+    """Drape over a smooth sphere with an analytic surface."""
     return sphere(n, smooth=True)
 
 
@@ -141,7 +141,7 @@ def damped_sphere(n: int) -> Scene:
 
 
 def woven_sphere(n: int) -> Scene:
-    """The same with woven cloth."""
+    """Drape woven cloth over a sphere."""
     stretch, bending = dc.Material().stretch, dc.Material().bending
     woven = dc.Material(
         stretch_weft=0.99 * stretch,
@@ -153,7 +153,7 @@ def woven_sphere(n: int) -> Scene:
 
 
 def gripper(n: int, **bounds: float) -> Scene:
-    """Let a hand down on a sheet that is held at two edges, while its drives close its fingers."""
+    """Lower a hand onto a sheet held at two edges, while its drives close its fingers."""
     vertices, faces = sheet(n)
     edges = [*range(n), *range(n * (n - 1), n * n)]
     hand = dc.Robot.load(
@@ -169,7 +169,7 @@ def gripper(n: int, **bounds: float) -> Scene:
 
 
 def limited_gripper(n: int) -> Scene:
-    """The same with friction, and drives at the limits of their efforts and speeds."""
+    """The gripper with joint friction, and drives at the limits of their efforts and speeds."""
     return gripper(n, effort_limits=2.0, velocity_limits=0.05, joint_friction=0.2)
 
 
@@ -177,7 +177,7 @@ def self_contact(n: int) -> Scene:
     """Lay one half of a folded sheet on the other, which hangs between two pinned rows."""
     vertices, faces = sheet(n)
     gap = 0.5 / (n - 1)
-    s = vertices[:, 1]  # along the fold; the upper half comes back over the lower one
+    s = vertices[:, 1]  # along the sheet; the upper half is folded back over the lower one
     lower = s < 0.0
     folded = np.stack([vertices[:, 0], np.where(lower, s, -s), np.where(lower, 0.0, gap)], axis=-1)
     last = int(lower.reshape(n, n)[:, 0].sum()) - 1
@@ -187,7 +187,7 @@ def self_contact(n: int) -> Scene:
 
 
 def two_sheets(n: int) -> Scene:
-    """Drop a turned sheet on another one, whose edges are held."""
+    """Drop a rotated sheet on another sheet with held edges."""
     vertices, faces = sheet(n)
     rim = np.abs(vertices[:, :2]).max(axis=1) > 0.5 - 1e-9
     lower = dc.Cloth(vertices, faces, pins={"rim": np.flatnonzero(rim).tolist()})
@@ -205,7 +205,7 @@ def moving_body(n: int) -> Scene:
 
 
 def twist(n: int) -> Scene:
-    """Turn two opposite edges against each other, while they come nearer."""
+    """Rotate two opposite edges against each other, while their distance decreases."""
     vertices, faces = sheet(n)
     pins = {"left": range(n), "right": range(n * (n - 1), n * n)}
 
@@ -282,9 +282,9 @@ BUCKLING: dict[str, Callable[[int], Scene]] = {
 def in_regime(
     simulator: dc.Simulator, scene: Scene, batch: int, kept: Path | None = None
 ) -> dc.State:
-    """The scene in its regime; the environments of a batch differ a little from each other.
+    """State of the scene in its regime; the environments of a batch differ slightly.
 
-    With `kept`, the state is read from this file, or written to it where there is none.
+    With `kept`, the state is read from this file, or written to the file if it does not exist.
     """
     state = simulator.initial_state(batch or None)
     if kept is not None and kept.exists():
@@ -303,5 +303,5 @@ def in_regime(
 
 
 def kept_file(folder: Path, name: str, size: int, batch: int) -> Path:
-    """File in which `in_regime` keeps a state for those who start there, too."""
+    """File in which `in_regime` stores a state for other runs that start there."""
     return folder / f"{name}-{size}-{batch}.pt"

@@ -1,20 +1,20 @@
-"""Schemes, metrics and elastic solvers on the same passive scenes: what each gives, and its price.
+"""Schemes, metrics and elastic solvers on the same passive scenes: accuracy and cost.
 
     python -m benchmarks.schemes            # minutes
     python -m benchmarks.schemes --quick    # seconds, on small meshes
 
-A sheet of 1 m falls on a sphere, slides over a floor, or falls on a box; nothing drives it.
+A sheet of 1 m falls on a sphere, slides over a floor, or falls on a box, without driving forces.
 
-pairs       pairs of triangles that intersect, the most in a state, as the IPC Toolkit finds them
+pairs       largest number of intersecting pairs of triangles in a state, found by the IPC Toolkit
 momentum    |change of linear momentum - impulse of gravity and of the bodies| over the impulse
             of gravity in a step, the largest
-energy      all that the mechanical energy rises in single steps, over what the sheet has to lose:
-            its kinetic energy at the start, and gravity's over the drop to the lowest state
-strain      of the edge that is stretched most [%], in any state
-iterations  of Newton's method in a step, + those of Projective Dynamics
-time        of the processor [ms], a step and its gradient
+energy      sum of the rises of mechanical energy in single steps, over the available energy:
+            kinetic energy at the start, plus gravity's over the drop to the lowest state
+strain      largest strain of an edge in any state [%]
+iterations  Newton iterations of a step, + iterations of Projective Dynamics
+time        processor time of a step and its gradient [ms]
 gradient    relative error of the derivative of a random function of a step's end by its velocities,
-            against central differences, the median over the steps that are checked
+            against central differences, the median over the checked steps
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ COLUMNS = (
     "gradient",
 )
 
-THICKNESS = 4e-3  # of the bodies [m]: nodes keep half of it away from them
+THICKNESS = 4e-3  # thickness of the bodies [m]; nodes keep half of it as distance
 CHECKED = 5  # steps whose gradients are compared with differences
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The body that a sheet meets, the velocity of the sheet at the start [m/s], and the steps."""
+    """The body below a sheet, the start velocity of the sheet [m/s], and the number of steps."""
 
     body: Callable[[], dc.RigidBody]
     velocity: tuple[float, float, float]
@@ -64,7 +64,7 @@ class Scene:
 
 
 def level(size: int) -> dc.Cloth:
-    """A level sheet, off the middle, so high that its barrier does not begin yet."""
+    """A level, off-center sheet, just above the range of its barrier."""
     vertices, faces = sheet(size)
     place = (0.02, 0.03, THICKNESS / 2 + 0.12 / (size - 1))
     return dc.Cloth(vertices + place, faces, material=dc.Material(bending=1e-4))
@@ -108,7 +108,7 @@ class Rollout:
 
 
 def roll_out(simulator: dc.Simulator, velocity: tuple[float, float, float], steps: int) -> Rollout:
-    """Take steps, each with its gradient, and check some of the gradients."""
+    """Run steps, each with its gradient, and check some of the gradients."""
     state = simulator.initial_state()
     speed = torch.tensor(velocity, dtype=torch.float64)
     states = [state.replace(velocities=state.velocities + speed)]
@@ -136,7 +136,7 @@ def weights(state: dc.State, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def step_and_slope(simulator: dc.Simulator, state: dc.State, seed: int) -> tuple[dc.State, float]:
-    """The state after a step, and the derivative of a function of it along a direction."""
+    """The state after a step, and the directional derivative of a function of this state."""
     function, direction = weights(state, seed)
     velocities = state.velocities.clone().requires_grad_()
     after = simulator.step(state.replace(velocities=velocities))
@@ -157,7 +157,7 @@ def difference(simulator: dc.Simulator, state: dc.State, seed: int) -> float:
 
 
 def momentum_error(mass: Tensor, states: list[dc.State]) -> float:
-    """What no force accounts for, over the impulse of gravity in a step."""
+    """Largest change of momentum without a force, over the impulse of gravity in a step."""
     weight = mass.sum() * torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
     largest = 0.0
     for before, after in itertools.pairwise(states):
@@ -168,7 +168,7 @@ def momentum_error(mass: Tensor, states: list[dc.State]) -> float:
 
 
 def energy_gained(simulator: dc.Simulator, mass: Tensor, states: list[dc.State]) -> float:
-    """Sum of the rises of the mechanical energy, over what there is to lose."""
+    """Sum of the rises of the mechanical energy, over the available energy."""
     kinetic = [simulator.kinetic_energy(state).item() for state in states]
     energies = [simulator.energy(s).item() + k for s, k in zip(states, kinetic, strict=True)]
     rises = np.maximum(np.diff(energies), 0).sum()
@@ -178,7 +178,7 @@ def energy_gained(simulator: dc.Simulator, mass: Tensor, states: list[dc.State])
 
 
 def iterations(reports: list[dc.Report]) -> str:
-    """Newton's, then local and global ones where there are any, of a step."""
+    """Mean Newton iterations of a step, and local/global iterations if there are any."""
     counts = [report.counts.get("local_global", 0) for report in reports]
     newton = f"{sum(report.iterations for report in reports) / len(reports):.1f}"
     return newton + (f" + {sum(counts) / len(reports):.0f}" if any(counts) else "")

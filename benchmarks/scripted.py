@@ -4,15 +4,15 @@
     python -m benchmarks.scripted --against ../other     # side by side
     python -m benchmarks.scripted --task LiftCloth --size 10 --certify gradients
 
-Environments simulate small, damped, frictional sheets in batches: other work than the sheets of
+Environments simulate small, damped, frictional sheets in batches, unlike the sheets of
 `benchmarks.step`. States and controls of `--steps` time steps are recorded once, with the other
-checkout if there is one. Both simulators, which come from the same file and have the same options,
-then take these very steps in turn, in processes that are pinned to the same core: a difference of
-the versions does not grow from step to step. Times are processor times per environment, medians
-over the steps; a ratio is other over this. `ends` is the largest distance between the vertices of
-both after a step. `core` is the sum of the phases of forward. `python` is the time of `env.step`
-outside of the core, per time step of the simulator and environment, of transitions that each
-version takes by itself; both are by the wall clock, medians.
+checkout if there is one. Both simulators are loaded from the same file with the same options, and
+repeat these recorded steps alternately, in processes pinned to one core: a difference between
+versions does not accumulate over steps. Times are processor times per environment, medians over the
+steps; a ratio is other over this. `ends` is the largest distance between the vertices of both after
+a step. `core` is the sum of the phases of forward. `python` is the time of `env.step` outside of
+the core, per time step and environment, measured in separate transitions of each version; both are
+medians of wall-clock time.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def main(
 def time_row(
     row: Row, against: Path | None, steps: int, turns: int, certify: str = "always"
 ) -> dict[str, Any]:
-    """Numbers of one row: of this checkout, and of the other if there is one."""
+    """Numbers of one row for this checkout, and for the other if there is one."""
     task, size, batch = row
     packages = [ROOT] if against is None else [ROOT, against]
     with TemporaryDirectory() as folder:

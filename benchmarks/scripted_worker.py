@@ -1,7 +1,7 @@
-"""One side of `benchmarks.scripted`: records, takes or times steps of an environment.
+"""One side of `benchmarks.scripted`: records, repeats or times steps of an environment.
 
-Run as a script with a job as JSON in the first line of its input; only the public interface of the
-package is used, so that versions can meet whose insides differ.
+The script reads a job as JSON from the first line of its input. It uses only the public interface
+of the package, so that versions with different internals can be compared.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def begun(job: dict[str, Any]) -> Any:
 
 
 def record(job: dict[str, Any]) -> None:
-    """Save the simulator of an environment, and states and controls of its steps by the script."""
+    """Save the simulator of an environment, and states and controls of its scripted steps."""
     import torch
 
     env = begun(job)
@@ -79,12 +79,12 @@ def record(job: dict[str, Any]) -> None:
 
 
 def timed_steps(job: dict[str, Any]) -> Any:
-    """Take the recorded steps in turn, without and with gradients; yield times and ends."""
+    """Repeat the recorded steps, without and with gradients; yield times and ends."""
     saved = pickle.loads(Path(job["file"]).read_bytes())
     simulator, taken = saved["simulator"], saved["taken"]
     if job["certify"] != "always":
         simulator = with_certify(simulator, job["certify"])
-    timed_step(simulator, *taken[0])  # caches fill, and the first backward imports modules
+    timed_step(simulator, *taken[0])  # warm-up: caches fill, and the first backward imports modules
     yield {}
     while True:
         for state, control in taken:
@@ -92,7 +92,7 @@ def timed_steps(job: dict[str, Any]) -> Any:
 
 
 def timed_step(simulator: Any, state: Any, control: Any) -> dict[str, Any]:
-    """Numbers of one step, taken without gradients and with them."""
+    """Numbers of one step without and with gradients."""
     import torch
 
     count = len(torch.as_tensor(state.time).reshape(-1))

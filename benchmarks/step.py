@@ -1,23 +1,23 @@
 """Time a step forward and backward, by scene, size and batch.
 
-    python -m benchmarks.step                                    # all of it: long
+    python -m benchmarks.step                                    # all scenes: long
     python -m benchmarks.step --scene sphere --size 24 --size 48
     python -m benchmarks.step --scene sphere --scene woven-sphere --size 24
     python -m benchmarks.step --quick                            # seconds
-    python -m benchmarks.step --scene hanging --scene air --scene damped    # what a potential costs
+    python -m benchmarks.step --scene hanging --scene air --scene damped    # cost of a potential
     python -m benchmarks.step --scene gripper --scene limited-gripper
 
 Times are medians with quartiles, in milliseconds per environment, and medians in EF: one numeric
-factorization of the contact-free Hessian of the same state by `Eigen::SimplicialLDLT`, timed in
-between the steps. Machines differ by more than the code does; EF divides most of that out. One core
-is used but where `threads` says otherwise: `torch.set_num_threads(1)`, as `--threads` sets it.
+factorization of the contact-free Hessian of the same state by `Eigen::SimplicialLDLT`, timed
+between the steps. EF mostly removes the differences between machines. One core is used unless
+`threads` is larger: `torch.set_num_threads(1)`, as set by `--threads`.
 
-Each step is differentiated: its backward takes cotangents of positions and velocities to those
-before the step and to the targets of the bodies. Solves are at the default tolerance. `touching`
-is the share of the cloth's vertices in a pair within the barrier distance, found by ipctk (of the
-extra `test`). The core tells phases for forward only; backward is one number. `tangent` and `x 8`
-are the times of one tangent and of eight at once over that of a backward, of the same inputs and
-outputs, all asked of the core for the last step.
+Each step is differentiated: backward maps cotangents of positions and velocities to positions and
+velocities before the step and to the targets of the bodies. Solves use the default tolerance.
+`touching` is the share of the cloth's vertices in a pair within the barrier distance, found by
+ipctk (of the extra `test`). The core reports phases only for forward; backward is one number.
+`tangent` and `x 8` are the times of one tangent and of eight at once over the time of a backward,
+for the same inputs and outputs, all in the core for the last step.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def main(
 def exponents_in_vertices(timings: list[Timing]) -> dict[str, dict[str, float]]:
     """Exponent p of time ~ vertices^p between the smallest size from 24 on and the largest.
 
-    Where nothing of 24 and more was timed at two sizes, between the smallest and the largest.
+    If fewer than two sizes from 24 on were timed, between the smallest and the largest of all.
     """
     result = {}
     for name in dict.fromkeys(timing.scene for timing in timings):
@@ -105,7 +105,7 @@ def exponents_in_vertices(timings: list[Timing]) -> dict[str, dict[str, float]]:
         ends = sorted(large if len(large) > 1 else single, key=lambda t: t.size)
         a, b = ends[0], ends[-1]
         if a.size == b.size:
-            continue  # one size tells no exponent
+            continue  # one size determines no exponent
         growth = 2.0 * math.log(b.size / a.size)
         result[name] = {
             "from": a.size,
@@ -117,7 +117,7 @@ def exponents_in_vertices(timings: list[Timing]) -> dict[str, dict[str, float]]:
 
 
 def batch_scaling(timings: list[Timing]) -> dict[str, dict[str, float]]:
-    """How many times faster a batch is on several threads than on one."""
+    """Speedup of a batch on several threads over one thread."""
     result = {}
     for name in dict.fromkeys(timing.scene for timing in timings):
         batches = {t.threads: t for t in timings if t.scene == name and t.batch > 0}
@@ -155,7 +155,7 @@ def _spread(s: Spread) -> str:
 
 
 def _number(value: float) -> str:
-    """Three digits, or all those before the point."""
+    """A number with three significant digits, or all digits before the point."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
@@ -192,7 +192,7 @@ def _print_summary(
 
 
 def _processor() -> str:
-    """Name of the processor, where Linux tells it."""
+    """Name of the processor, if Linux reports one."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

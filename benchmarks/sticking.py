@@ -1,12 +1,13 @@
-"""What a smaller slip velocity costs, and how far what a gripper holds creeps.
+"""Cost of a smaller slip velocity, and creep of objects that a gripper holds.
 
     python -m benchmarks.sticking
     python -m benchmarks.sticking --quick     # seconds: shows that it runs
 
-First the scenes of `benchmarks/scenes.py` in contact, at each slip velocity: Newton iterations and
-processor time of a step, medians of `--steps` steps from where the scene is in its regime. Then a
-cloth and a box that two plates hold against gravity for `--seconds`: how far they sink, beside
-what the law says, v = e (1 - sqrt(1 - T / (mu N))) with the load T and the normal forces N.
+The first part runs the scenes of `benchmarks/scenes.py` in contact, at each slip velocity: Newton
+iterations and processor time of a step, medians of `--steps` steps in the scene's regime. The
+second part holds a cloth and a box between two plates against gravity for `--seconds`: the distance
+by which they sink, beside the law v = e (1 - sqrt(1 - T / (mu N))) with the load T and the normal
+forces N.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime
 NAMES = ("plane", "sphere", "self-contact", "two-sheets", "moving-body", "twist", "crumple")
 SLIPS = (1e-3, 1e-4, 1e-5, 1e-6)  # [m/s]
 FRICTION = 0.6
-GAP = 0.6  # of the barrier distance, between a plate and what it holds
+GAP = 0.6  # gap between a plate and the held object, relative to the barrier distance
 
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
@@ -73,7 +74,7 @@ def _cost(name: str, size: int, steps: int, slip: float) -> tuple[float, float]:
 
 
 def held(what: str, slip: float, seconds: float) -> tuple[float, float, float]:
-    """Share of friction that the load needs, creep and that of the law [m]."""
+    """Share of friction that the load needs, measured creep and creep by the law [m]."""
     d_hat, thickness = 1e-3, 0.02 if what == "box" else 0.0
     x = thickness / 2 + GAP * d_hat + 0.01
     plates = [
@@ -97,7 +98,7 @@ def held(what: str, slip: float, seconds: float) -> tuple[float, float, float]:
     simulator = dc.Simulator(dc.Scene(cloths, plates), 0.02, contact=contact)
 
     def height(state: dc.State) -> float:
-        """Of the box, or of the cloth's vertices between the fingers."""
+        """Height of the box, or mean height of the cloth's vertices between the plates [m]."""
         if what == "box":
             return float(state.body_poses[-1, 2])
         start = simulator.initial_state().positions
@@ -106,7 +107,7 @@ def held(what: str, slip: float, seconds: float) -> tuple[float, float, float]:
 
     state = simulator.initial_state()
     with torch.no_grad():
-        for _ in range(50):  # until it hangs
+        for _ in range(50):  # until the object hangs
             state = simulator.step(state)
         start = height(state)
         steps = round(seconds / simulator.dt)

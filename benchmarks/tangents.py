@@ -75,7 +75,7 @@ def main(size: int, steps: int, repeats: int) -> None:
     }
     times: dict[str, list[float]] = {name: [] for name in calls}
     found = {}
-    alone()  # what is made once is not timed
+    alone()  # warm-up, not timed
     for _ in range(repeats):
         for name, call in calls.items():
             taken, found[name] = seconds(call)

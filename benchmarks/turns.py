@@ -1,19 +1,19 @@
-"""How much energy contact gives to bodies that turn.
+"""Energy that contact adds to rotating bodies.
 
     python -m benchmarks.turns            # two minutes
     python -m benchmarks.turns --quick    # seconds
 
-Two tables. In the first, boxes of three shapes are thrown on a floor without gravity, with a
-first turn of so many radians a step. The columns: steps in contact; throws that are refused in
-the end, as the box turned by more than 1 rad before or after a step; steps in which the kinetic
-and the stored energy together rise by more than a thousandth of the kinetic energy; the largest
-rise over the kinetic energy, negative where all steps lose.
+The first table throws boxes of three shapes on a floor without gravity, with an initial rotation
+of so many radians per step. Columns: steps in contact; throws that are finally refused, because
+the box rotated by more than 1 rad before or after a step; steps in which the sum of kinetic and
+stored energy rises by more than a thousandth of the kinetic energy; the largest rise over the
+kinetic energy, negative if all steps lose energy.
 
-In the second, balls that are meshes roll on a level floor for `--seconds`. The corner that
-carries the weight gives g h^2 / (1.4 r) of the kinetic energy of a solid ball in a step, whatever
-its speed: the force acts where the corner is at the end of the step, a little behind the middle
-of its arc. The columns: faces; time step; radians a step; steps; rises as before; the largest of
-them; that formula; the energy at the end over that at the start.
+The second table rolls balls that are meshes on a level floor for `--seconds`. The corner that
+carries the weight adds g h^2 / (1.4 r) of the kinetic energy of a solid ball in a step, at any
+speed: the force acts at the corner's position at the end of the step, slightly behind the middle
+of its arc. Columns: faces; time step; radians per step; steps; rises as before; the largest rise;
+the formula; the energy at the end over the energy at the start.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def roll(subdivisions: int, dt: float, speed: float, seconds: float) -> str:
 
 
 def rises(size: tuple[float, float, float], turn: float, throws: int) -> Iterator[float | None]:
-    """Of each step in contact the rise of energy over the kinetic energy; None where refused."""
+    """Rise of energy over the kinetic energy for each step in contact; None if refused."""
     for seed in range(throws):
         try:
             simulator, state = thrown(size, turn, seed)

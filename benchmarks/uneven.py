@@ -1,10 +1,10 @@
-"""A batch whose environments take unequal times, on two threads.
+"""A batch of environments with unequal costs, on two threads.
 
-Sheets hang by points of their rim, and some are crumpled by drawing these points together; those
-come last in the batch. From the seconds that each environment takes on one thread follows how long
-two threads take that begin in the order of the batch, with what took longest in the step before,
-as the core does, and at best; the ratios are to one thread. So another program on the same cores
-does not count. `measured` is the ratio of wall-clock times as they were.
+Sheets hang by points of their rim, and some are crumpled by moving these points together; the
+crumpled ones are last in the batch. The time of each environment on one thread determines the time
+of two threads that start in the order of the batch, with the slowest of the previous step (as the
+core does), and in the best order; the ratios are relative to one thread. Other programs on the same
+cores therefore do not count. `measured` is the ratio of measured wall-clock times.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _held(scene: dc.Scene) -> list[int]:
 
 
 def makespan(seconds: Sequence[float]) -> float:
-    """What threads take that take one after the other, each as soon as it can."""
+    """Time of threads that process environments in this order, each as soon as it is idle."""
     ends = [0.0] * THREADS
     for value in seconds:
         heapq.heapreplace(ends, ends[0] + value)
@@ -75,7 +75,7 @@ def makespan(seconds: Sequence[float]) -> float:
 
 
 def best_makespan(seconds: Sequence[float]) -> float:
-    """The least that two threads can take: the more even of all ways to share."""
+    """Smallest possible time of two threads, over all partitions."""
     everything = sum(seconds)
     parts = [
         sum(part) for count in range(len(seconds) + 1) for part in combinations(seconds, count)

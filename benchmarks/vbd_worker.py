@@ -1,11 +1,11 @@
 """One scene with Newton's Vertex Block Descent (`newton` 1.x on `warp`), on the processor, forward.
 
-`benchmarks.forward_peers` runs this file as a script, in the environment that has Newton, and tells
-it a scene as JSON. It needs nothing of ours, so that the two need not live in one environment.
+`benchmarks.forward_peers` runs this file as a script in the environment with Newton, and passes a
+scene as JSON. The script does not import this package, so the two may be in separate environments.
 
-Settings are those of Newton's examples of cloth: ten substeps of a frame and ten iterations
-(`cloth_hanging`, `cloth_bending`); distances of self-contact, stiffness and damping of contact as
-in `cloth_twist`, whose sheet is as large and as heavy. A frame is captured once and launched.
+Settings follow Newton's cloth examples: ten substeps per frame and ten iterations (`cloth_hanging`,
+`cloth_bending`); distances of self-contact, stiffness and damping of contact as in `cloth_twist`,
+whose sheet has the same size and weight. A frame is captured once and then launched.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import newton
 import numpy as np
 import warp as wp
 
-SUBSTEPS = 10  # even, so that a frame ends in the state that it began with
+SUBSTEPS = 10  # even, so that a frame ends in the state buffer in which it began
 ITERATIONS = 10
 MARGIN, GAP = 0.002, 0.0015  # of self-contact [m]
 CONTACT_STIFFNESS, CONTACT_DAMPING = 1e3, 1e-1

@@ -1,8 +1,8 @@
-"""One side of a comparison: steps a scene with the package in a given folder, step by step.
+"""One side of a comparison: times single steps of a scene with the package of a given folder.
 
-`benchmarks.compare` runs this file as a script, tells it a row as JSON in the first line of its
-input, and then asks for one timed step with each further line. Only the public interface of the
-package is used, so that versions can meet whose insides differ.
+`benchmarks.compare` runs this file as a script, passes a row as JSON in the first line of its
+input, and requests one timed step with each further line. The script uses only the public interface
+of the package, so that versions with different internals can be compared.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def main() -> None:
     os.sched_setaffinity(0, row["cores"])
     use_package(Path(row["package"]))
     steps = timed_steps(row)
-    print(json.dumps(next(steps)), flush=True)  # ready: how the approach went
+    print(json.dumps(next(steps)), flush=True)  # ready: result of the approach
     for _ in sys.stdin:
         print(json.dumps(next(steps)), flush=True)
 
@@ -79,7 +79,7 @@ def timed_steps(row: dict[str, Any]) -> Any:
                 torch.autograd.backward(outputs, cotangents)
                 backward = (clock() - start) / count
             except dc.SimulationError:
-                converged = 0  # at a saddle, which the first version takes for a minimum
+                converged = 0  # at a saddle, which the first version accepts as a minimum
         yield {
             "forward": forward / count,
             "backward": backward,

@@ -1,4 +1,4 @@
-"""Drape a mesh of your own over another one, in Python: what `diffcloth run` does from YAML.
+"""Drape a mesh of your own over another one: the Python form of `diffcloth run`.
 
 python examples/drape_own_mesh.py CLOTH.obj BODY.ply
 """
@@ -19,7 +19,7 @@ import diffcloth_torch as dc
 @click.option("--steps", default=100, help="Steps of 0.01 s.")
 @click.option("--out", default="draped.obj", type=click.Path(path_type=Path, dir_okay=False))
 def main(cloth_path: Path, body_path: Path, height: float, steps: int, out: Path) -> None:
-    """Let CLOTH_PATH fall on BODY_PATH and write where it comes to lie."""
+    """Drop CLOTH_PATH onto BODY_PATH and write the draped cloth."""
     cloth = dc.Cloth.load(cloth_path, pose=[0, 0, height, 1, 0, 0, 0])
     simulator = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.load(body_path)]), dt=0.01)
     states = simulator.rollout(simulator.initial_state(), steps=steps)

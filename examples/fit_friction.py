@@ -1,9 +1,9 @@
-"""Fit the friction of a sheet to how far it slid: an optimizer of torch over a parameter.
+"""Fit the friction of a sheet to its sliding path: an optimizer of torch over a parameter.
 
     python examples/fit_friction.py
 
-A sheet slides along a table. The data are its path in a simulation whose time step is a fifth as
-long. Friction must stay positive: its logarithm is what the optimizer changes.
+A sheet slides along a table. The data are its path in a simulation with a fifth of the time step.
+Friction must stay positive: the optimizer therefore changes its logarithm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 import diffcloth_torch as dc
 
 F64 = torch.float64
-DURATION, FRICTION = 0.2, 0.3  # [s], and what is to be found
+DURATION, FRICTION = 0.2, 0.3  # [s], and the value to be found
 
 
 def thrown(dt: float) -> tuple[dc.Simulator, dc.State]:
@@ -30,7 +30,7 @@ def thrown(dt: float) -> tuple[dc.Simulator, dc.State]:
 
 
 def middles(states: list[dc.State]) -> torch.Tensor:
-    """Where the middle of the sheet is along its way [m]."""
+    """Position of the middle of the sheet along x in each state [m]."""
     return torch.stack([state.positions[:, 0].mean() for state in states])
 
 

@@ -3,7 +3,8 @@
     python examples/joint_limits.py
 
 Four motors of one arm are a batch of four environments: strong, slow, stiff with friction, and too
-weak, which rests where its limit holds the weight. Where the effort counts, so does its gradient.
+weak. The weak arm rests at the angle at which its effort limit balances the weight, and has a
+gradient by this limit.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Optimize a pull from several guesses at once: a batch whose environments have a control each.
+"""Optimize a pull from several guesses at once: a batch with one control per environment.
 
     python examples/optimize_batch.py
 
-A sheet hangs by two corners; forces on its lower corners shall bring its middle to a goal. Each
-environment of the batch starts from forces of its own and goes its own way by Adam: the best is
-what counts. An environment whose step fails goes back half way to its best forces.
+A sheet hangs by two corners; forces on its lower corners must move its middle to a goal. Each
+environment of the batch starts from a different guess, and Adam optimizes each independently: the
+best one counts. An environment whose step fails goes back half way to its best forces.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def simulate(variables: Mapping[str, torch.Tensor]) -> list[dc.State]:
 
 
 def distances(states: list[dc.State]) -> torch.Tensor:
-    """How far the middle of each sheet is from the goal at the end [m]."""
+    """Final distance of the middle of each sheet from the goal [m]."""
     return (states[-1].positions.mean(dim=1) - goal).norm(dim=1)
 
 

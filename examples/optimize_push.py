@@ -1,9 +1,9 @@
-"""Optimize how hard a cube is pushed into a hanging cloth, in 40 lines and without a config.
+"""Optimize the push of a cube into a hanging cloth, in 40 lines and without a configuration.
 
     python examples/optimize_push.py
 
-The cube moves along y on prescribed poses; its speed is found by gradient descent, so that the
-middle of the cloth ends 0.15 m from where it hung.
+The cube moves along y on prescribed poses. Gradient descent finds the speed for which the middle of
+the cloth ends 0.15 m from its start.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Point clouds in the PCD format of the Point Cloud Library, version 0.7: their x, y and z.
 
 The header names fields with a size, a type and a count each; the data are text, or rows of bytes.
-Compressed data are refused. `examples/rgbench.py` reads clouds with it.
+Compressed data are refused. `examples/rgbench.py` uses this reader.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_pcd(path: Path, data: bytes) -> FloatArray:
         Points in the unit of the file, shape [n, 3].
 
     Raises:
-        InvalidInput: If it is no such file.
+        InvalidInput: If the file is no valid PCD file.
     """
     lines, start = _header_lines(path, data)
     header = _header(path, lines)

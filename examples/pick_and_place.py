@@ -1,9 +1,9 @@
-"""Fold a sheet with a picker: close on a corner, carry it over, let go; the path by gradient.
+"""Fold a sheet with a picker: grasp a corner, carry it over, release it; the path by gradient.
 
     python examples/pick_and_place.py
 
-The picker is an attachment whose target and weight are controls. A few points of its path are found
-by the gradient of where the corner and its neighbors lie at the end.
+The picker is an attachment whose target and weight are controls. The gradient of the final
+positions of the corner and its neighbors optimizes a few points of the picker's path.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def path(knots: torch.Tensor) -> torch.Tensor:
 
 
 def fold(knots: torch.Tensor) -> dc.State:
-    """The state after the picker has carried the corner and let go."""
+    """The state after the picker has carried and released the corner."""
     state = start
     for target in path(knots):
         state = simulator.step(state, dc.Control(attachments={"picker": target[None]}))
@@ -52,7 +52,7 @@ def fold(knots: torch.Tensor) -> dc.State:
 
 
 def loss(state: dc.State) -> torch.Tensor:
-    """How far the corner and its mirror image are apart, in the plane [m^2]."""
+    """Squared distance of the corner from its mirror image, in the plane [m^2]."""
     off = state.positions[CORNER, :2] - there[:2]
     return (off**2).sum()
 

@@ -2,9 +2,9 @@
 
     python examples/plan_grasp.py                    (needs the extra `robots`)
 
-A Panda takes the edge of a cloth on a table. Inverse kinematics find joints that bring its hand
-there; the Jacobian leads the hand along a straight line, whose end is what is optimized, so that
-the middle of the cloth gets to a goal. Gradients flow through the simulation and the plan.
+A Panda grasps the edge of a cloth on a table. Inverse kinematics find joints that move its hand
+there; the Jacobian moves the hand along a straight line. The end of this line is optimized, so that
+the middle of the cloth reaches a goal. Gradients flow through the simulation and the plan.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import diffcloth_torch as dc
 
 F64 = torch.float64
 DT, CLOSING, LIFTING = 0.02, 8, 12  # [s], and steps
-GRASP = [0.5356, 0.0, 0.6260]  # of the hand, 0.11 m behind the tips of its fingers [m]
+GRASP = [0.5356, 0.0, 0.6260]  # position of the hand, 0.11 m behind the tips of its fingers [m]
 FORWARD = [0.5, 0.5, 0.5, 0.5]  # the fingers point along x, one above the other
-GOAL = [0.65, 0.02, 0.65]  # of the middle of the cloth, which starts at [0.68, 0, 0.626]
+GOAL = [0.65, 0.02, 0.65]  # for the middle of the cloth, which starts at [0.68, 0, 0.626]
 ROUGHLY = [0.0, -0.3, 0.0, -2.0, 0.0, 3.4, -0.6]  # joints to start the search from [rad]
 
 
@@ -53,7 +53,7 @@ def reach(serial: pk.SerialChain, position: list[float]) -> list[float]:
 
 
 def follow(serial: pk.SerialChain, arm: torch.Tensor, way: torch.Tensor) -> list[torch.Tensor]:
-    """Joints along a straight way [3] of the hand, which does not turn; one row for each step."""
+    """Joints along a straight path [3] of the hand without rotation; one row for each step."""
     rows = [arm]
     velocity = torch.cat([way / LIFTING, torch.zeros(3, dtype=F64)])
     for _ in range(LIFTING):
@@ -77,7 +77,7 @@ names = [f"panda/{name}" for name in serial.get_joint_parameter_names()]
 
 
 def carry_out(variables: dict[str, torch.Tensor]) -> list[dc.State]:
-    """Close the fingers, then move the hand along the way."""
+    """Close the fingers, then move the hand along the path."""
     arm = torch.tensor(grasp, dtype=F64)
     plan = [arm] * CLOSING + follow(serial, arm, variables["way"])
     closing = {"panda/panda_finger_joint1": torch.tensor(-20.0, dtype=F64)}
@@ -89,7 +89,7 @@ def carry_out(variables: dict[str, torch.Tensor]) -> list[dc.State]:
 
 
 def distance(states: list[dc.State]) -> torch.Tensor:
-    """How far the middle of the cloth is from the goal at the end [m]."""
+    """Final distance of the middle of the cloth from the goal [m]."""
     middle = states[-1].positions.mean(dim=0)
     return (middle - torch.tensor(GOAL, dtype=F64)).norm()
 

@@ -2,8 +2,8 @@
 
     python examples/public_robots.py panda tiago     (needs the extras `robots` and `viewer`)
 
-Their files are those of example-robot-data, as they are. The picture of a robot is robot_NAME.png;
-without names, all of them are drawn.
+The robots' files come from example-robot-data, unchanged. The picture of a robot is robot_NAME.png;
+without names, all robots are drawn.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ DT, FALLING, MOVING = 0.02, 30, 30  # [s], and steps
 
 
 class Pose(NamedTuple):
-    """A robot of example-robot-data, and what it does.
+    """A robot of example-robot-data, and its motion.
 
     Attributes:
-        file: End of the path of its file.
+        file: End of the path of the robot's file.
         size: Side of the sheet [m].
-        start: Joint -> where it starts [rad or m]; the others are as near to zero as they can be.
-        move: Joint -> how far it moves under the sheet [rad or m].
-        azimuth: Direction from which it is seen [degrees].
+        start: Joint -> start position [rad or m]; other joints are as near to zero as possible.
+        move: Joint -> distance of the motion under the sheet [rad or m].
+        azimuth: Viewing direction [degrees].
     """
 
     file: str
@@ -61,7 +61,7 @@ def find(end: str) -> Path:
 
 
 def top_of(robot: dc.Robot) -> list[float]:
-    """The highest point of its links [m]."""
+    """Highest point of a robot's links [m]."""
     frames = robot.forward_kinematics(torch.tensor(robot.joint_positions))
     points = [
         torch.tensor(surface.vertices) @ frames[name][:3, :3].T + frames[name][:3, 3]
@@ -72,7 +72,7 @@ def top_of(robot: dc.Robot) -> list[float]:
 
 
 def simulate(pose: Pose, cells: int = 24) -> tuple[dc.Scene, list[dc.State]]:
-    """Let a sheet of so many rows fall on a robot, which then moves."""
+    """Drop a sheet of `cells` rows onto a robot, which then moves."""
     robot = dc.Robot.load(
         find(pose.file), joint_positions=pose.start, actuation="position", name="robot"
     )

@@ -1,9 +1,9 @@
-"""Captures of real garments in the format of RGBench, to fit to them or to be measured by them.
+"""Captures of real garments in the format of RGBench, for fits and for evaluation.
 
     python examples/rgbench.py green_tshirt/green_tshirt_grasp_2025-07-19-19-14-58
 
 RGBench records garments that two robot arms fling, fold or grasp, as point clouds of a camera. A
-folder of its data set `RGBench-Cloth-Sim2Real-v1` holds, for each capture,
+folder of its data set `RGBench-Cloth-Sim2Real-v1` contains, for each capture,
 
     calibration/world_to_camera_transform.json              4 x 4 matrix, camera from world
     joints/{left,right}_arm_joint_states_and_end_pose.csv   with columns time, pos_x, pos_y, pos_z
@@ -67,9 +67,9 @@ class Capture:
     """Point clouds of a garment, in world axes, and the motion of the grippers.
 
     Attributes:
-        times: Of the frames [s], from the first row of the arms, with the camera's delay: the times
-            that simulated states are compared at.
-        clouds: Of each frame the points [m], shape [n, 3].
+        times: Times of the frames [s], from the first row of the arms, with the camera's delay: the
+            times for comparison with simulated states.
+        clouds: Points of each frame [m], shape [n, 3].
         arms: Name of an arm -> times [s], shape [k], and positions of its gripper [m], [k, 3].
     """
 
@@ -91,10 +91,10 @@ class Capture:
         return [max(round(float(time) / dt), 1) for time in self.times]
 
     def between(self, first: float, last: float) -> Capture:
-        """The frames between two times [s], as in the window that the protocol evaluates.
+        """The frames between two times [s], such as the evaluation window of the protocol.
 
         Raises:
-            InvalidInput: If there are none.
+            InvalidInput: If there is no frame between the times.
         """
         first = check_number("Capture.between: `first`", first, ANY_NUMBER)
         last = check_number("Capture.between: `last`", last, ANY_NUMBER)
@@ -113,12 +113,12 @@ def read_capture(
     delay: float = 0.0,
     bases: Mapping[str, Sequence[float]] = BASES,
 ) -> Capture:
-    """Read a capture. Frames before the arms move are left out, and so are empty ones.
+    """Read a capture without empty frames and without frames before the arms move.
 
     Args:
         folder: Folder of the capture.
-        delay: By which the camera is late [s], >= 0; the benchmark lists one for each capture.
-        bases: Where the arms stand in world axes [m]. Arms without a file are left out.
+        delay: Delay of the camera [s], >= 0; the benchmark lists one for each capture.
+        bases: Positions of the arms in world axes [m]. Arms without a file are left out.
 
     Raises:
         InvalidInput: If a file does not have the format, or no frame or arm is left.
@@ -154,10 +154,10 @@ def read_capture(
 
 
 def nearest_vertices(positions: object, grippers: Mapping[str, object]) -> dict[str, int]:
-    """The vertex that each gripper takes in the protocol "fixed point": the nearest to it.
+    """The vertex that each gripper holds in the protocol "fixed point": its nearest vertex.
 
     Args:
-        positions: Vertices of the garment when it is taken [m], shape [N, 3].
+        positions: Vertices of the garment at the grasp [m], shape [N, 3].
         grippers: Name of an arm -> position of its gripper [m], shape [3].
 
     Raises:
@@ -182,12 +182,13 @@ def nearest_vertices(positions: object, grippers: Mapping[str, object]) -> dict[
 def chamfer(states: Sequence[State], clouds: Sequence[object], *, norm: int = 1) -> list[float]:
     """Mean distance [m] of the observed points of each frame to the nearest simulated vertex.
 
-    One-sided, from real to simulated. The benchmark reports it with the norm 1, the sum of the
-    absolute differences of the coordinates. For a fit, `dc.residuals.point_cloud` has residuals.
+    The distance is one-sided, from real to simulated. The benchmark reports the distance by norm 1,
+    the sum of the absolute differences of the coordinates. `dc.residuals.point_cloud` computes
+    residuals for fits.
 
     Args:
         states: States without a batch axis, one for each cloud.
-        clouds: Of each frame the points [m], shape [n, 3], n >= 1.
+        clouds: Points of each frame [m], shape [n, 3], n >= 1.
         norm: 1 or 2.
 
     Raises:

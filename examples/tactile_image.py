@@ -1,9 +1,9 @@
-"""What the pad of a finger feels: the pressure of a pen through a cloth, as an image.
+"""Pressure of a pen through a cloth on the pad of a finger, as a tactile image.
 
     python examples/tactile_image.py [IMAGE.png]
 
-The fingers of a gripper close on a cloth that hangs in front of a fixed, tilted pen. The contacts
-of a finger, their points in its frame and their normal forces make its tactile image.
+The fingers of a gripper close on a cloth that hangs in front of a fixed, tilted pen. The tactile
+image of a finger consists of its contacts: their points in the finger's frame and normal forces.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import diffcloth_torch as dc
 F64 = torch.float64
 STEPS, EFFORT = 40, 4.0  # time steps of 10 ms, and the closing force of each finger [N]
 FINGER = "gripper/left_finger"
-WIDTH, LENGTH = 0.02, 0.05  # of its pad, along x and z of its frame [m]
-PIXEL, BLUR = 5e-4, 1e-3  # of the image, and the depth of the pad's skin [m]
+WIDTH, LENGTH = 0.02, 0.05  # size of the finger's pad, along x and z of its frame [m]
+PIXEL, BLUR = 5e-4, 1e-3  # size of a pixel, and depth of the pad's skin [m]
 
 top = range(21 * 24, 21 * 25)
 cloth = dc.Cloth.grid(
@@ -47,7 +47,7 @@ def tactile_image(state: dc.State) -> torch.Tensor:
     points = (contacts.points[contacts.mask, 1] - frame[:3, 3]) @ frame[:3, :3]
     x = torch.arange(-WIDTH / 2 + PIXEL / 2, WIDTH / 2, PIXEL, dtype=F64)
     z = torch.arange(PIXEL / 2, LENGTH, PIXEL, dtype=F64)
-    # Skin spreads a force over its depth; what is spread adds up to one.
+    # Skin spreads a force over its depth; the spread weights add up to one.
     spread = [
         torch.exp(-0.5 * ((axis - points[:, k, None]) / BLUR) ** 2) / (BLUR * (2 * np.pi) ** 0.5)
         for axis, k in ((z, 2), (x, 0))

@@ -1,10 +1,10 @@
-"""A sheet drapes over a figure that walks: a body that deforms by prescription.
+"""A sheet drapes over a walking figure: a body with prescribed deformation.
 
     python examples/walker.py
 
 The figure is one mesh: a trunk and two legs, which a skeleton of two hips moves (linear blend
-skinning). Its vertices are a function of time and of the length of its strides, in torch, so that
-the gradient of where the sheet ends goes back to the stride.
+skinning). Its vertices are a torch function of time and of the length of its strides, so the final
+position of the sheet has a gradient by the stride.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DT, STEPS = 0.01, 100
 SPEED = 0.6  # [m/s]
 HIP = torch.tensor([0.0, 0.0, 0.45], dtype=F64)
 
-# The trunk lies along y above the hips, and the legs hang below them. Parts of the mesh overlap.
+# The trunk lies along y above the hips, from which the legs hang. Parts of the mesh overlap.
 trunk, trunk_faces = shapes.capsule(0.07, 0.2, rings=4, rows=4)
 leg, leg_faces = shapes.capsule(0.04, 0.35, rings=3, rows=8)
 parts = [
@@ -31,9 +31,9 @@ parts = [
 starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
 bind = torch.from_numpy(np.concatenate([vertices for vertices, _ in parts]))
 faces = np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=False)])
-side = torch.zeros(len(bind), dtype=F64)  # leg that a vertex belongs to: -1, 1; 0 for the trunk
+side = torch.zeros(len(bind), dtype=F64)  # leg of a vertex: -1, 1; 0 for the trunk
 side[starts[1] : starts[2]], side[starts[2] :] = -1.0, 1.0
-# Share of the hip's turn that moves a vertex: none at the hip, all of it 10 cm below.
+# Share of the hip's rotation that moves a vertex: zero at the hip, one 10 cm below.
 share = side.abs() * ((HIP[2] - bind[:, 2]) / 0.1).clamp(0, 1)
 
 

@@ -1,4 +1,4 @@
-"""Selection of the quick suite: parameters of a test beside those of its mark `quick` are slow."""
+"""Selection of the quick suite: parameters that a test's mark `quick` does not match are slow."""
 
 import fnmatch
 

@@ -1,4 +1,4 @@
-"""Steps as the core takes them, and derivatives that are asked of it by the names of its inputs."""
+"""Steps of the core on named arrays, and their derivatives by named inputs."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ OUTPUTS = (
 
 
 class Spy:
-    """A core that remembers the inputs of its last step."""
+    """A core that records the inputs of its last step."""
 
     def __init__(self, core):
         self.core, self.inputs = core, {}
@@ -32,7 +32,7 @@ class Spy:
 
 
 def inputs_of(sim, step: Callable[[], object]):
-    """The core and what it gets when step() is called, the rest shape included."""
+    """The core, and its inputs during a call of step(), including the rest shape."""
     spy = Spy(sim._engine.core)
     sim._engine.core = spy
     try:
@@ -53,7 +53,7 @@ def outputs_of(result):
 
 
 def directions(inputs):
-    """One of each input, the others at rest -> names and tangents [K, 1, ..]."""
+    """One tangent per input, zero for the others: names and tangents [K, 1, ..]."""
     names = [name for name, values in inputs.items() if values.size]
     tangents = {}
     for k, name in enumerate(names):
@@ -63,7 +63,7 @@ def directions(inputs):
 
 
 def losses(result):
-    """One of each output."""
+    """One cotangent per output, zero for the others."""
     outputs = {name: values for name, values in outputs_of(result).items() if values.size}
     cotangents = {
         name: np.zeros((len(outputs), *values.shape)) for name, values in outputs_of(result).items()
@@ -76,8 +76,8 @@ def losses(result):
 def check_pairs(core, inputs, result, tolerance=TOLERANCE):
     """<u, J v> = <J^T u, v> for each input alone and each output alone.
 
-    A pair may be off by the rounding of its own sum, and by what the rounding of the solution does
-    to the output: as much as the input that moves it most, per motion of the cloths.
+    A pair may be off by the rounding of its own sum, and by the effect of the solution's rounding
+    on the output: this effect is bounded by the input with the largest effect per cloth motion.
 
     Returns:
         The outputs that change with some input.

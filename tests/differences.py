@@ -15,14 +15,14 @@ F64 = torch.float64
 _CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 _FORWARD = ((0, -25 / 12), (1, 4), (2, -3), (3, 4 / 3), (4, -1 / 4))
 
-# Where a difference misses, other steps are tried: rounding wants larger, kinks want smaller ones.
+# Other steps, tried if a difference fails: rounding needs larger steps, kinks need smaller ones.
 _SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256, 1 / 1024, 1 / 4096, 8.0, 32.0)
-# A derivative that differences still resolve to five digits, beside the noise of a solve.
+# Smallest derivative that differences resolve to five digits despite the noise of a solve.
 _RESOLVED = 1e-8
 
 
 def directions(tensor: torch.Tensor, generator: torch.Generator) -> Iterator[torch.Tensor]:
-    """One unit direction per entry of a small tensor; a dense and two sparse ones of a large."""
+    """One unit direction per entry of a small tensor; a dense and two sparse ones for a large."""
     if tensor.numel() <= 3:
         for k in range(tensor.numel()):
             unit = torch.zeros(tensor.numel(), dtype=F64)
@@ -60,9 +60,9 @@ def mismatch(
     *,
     forward: bool = False,
 ) -> float:
-    """Smallest relative error over a sweep of steps, ended where it is below rtol.
+    """Smallest relative error over a sweep of steps, which ends at an error below rtol.
 
-    Relative to the root of the sum of squares of the terms of gradient . d: their sum may cancel.
+    Relative to the root of the sum of squares of the terms of gradient . d, whose sum may cancel.
     """
     expected = float((gradient * d).sum())
     scale = float((gradient * d).norm())
@@ -72,7 +72,7 @@ def mismatch(
     for factor in _SWEEP:
         try:
             found = difference(f, x, d, factor * step, forward=forward)
-        except ValueError:  # a step so long that it leaves the accepted range
+        except ValueError:  # the step leaves the accepted range
             continue
         best = min(best, abs(found - expected) / scale if scale else abs(found))
         if best <= rtol:
@@ -86,7 +86,7 @@ def directional(
     names: Sequence[str],
     seed: int = 0,
 ) -> float:
-    """Relative error of a gradient by named inputs along one random direction of all of them."""
+    """Relative error of a gradient along one random direction in all named inputs."""
     leaves = {n: x.clone().requires_grad_() for n, x in inputs.items() if n in names}
     found = torch.autograd.grad(f({**inputs, **leaves}), list(leaves.values()))
     g = torch.Generator().manual_seed(seed)
@@ -108,9 +108,9 @@ def directional(
 def slope_error(points: Sequence[tuple[float, float, float]]) -> float:
     """Smallest relative error of the slopes of a function with branches, over every two points.
 
-    A point is (t, value, slope). Where a step has several minima, points as near as rounding may
-    lie on different branches, and a difference across branches says nothing. On one branch it is
-    the mean of the slopes at its ends, up to second order in their distance.
+    A point is (t, value, slope). If a step has several minima, points at a distance of rounding may
+    lie on different branches, and a difference across branches is meaningless. On one branch the
+    difference is the mean of the slopes at its ends, up to second order in their distance.
     """
     t, value, slope = np.array(points).T
     a, b = np.triu_indices(len(t), 1)

@@ -1,4 +1,4 @@
-"""Threads of torch and processes of Python, for tests that need some of their own."""
+"""Threads of torch and processes of Python, for tests that need separate ones."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ PATIENCE = 120.0  # seconds, for a machine under load
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Set torch's number of threads, which is also that of a step, for a while."""
+    """Context with a number of threads for torch and for steps."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -25,7 +25,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def run_python(code: str, **options) -> str:
-    """What a script prints that must not fail, with options of `subprocess.run`."""
+    """Output of a script, which must succeed, with options of `subprocess.run`."""
     result = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
         capture_output=True,
@@ -38,7 +38,7 @@ def run_python(code: str, **options) -> str:
 
 
 def lives(pid: int) -> bool:
-    """Whether a process runs; one that ended may wait for its parent as a zombie."""
+    """Return whether a process runs; an ended process may be a zombie until its parent waits."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
@@ -56,7 +56,7 @@ def children(pid: int) -> list[int]:
 
 
 def await_that(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Wait until a condition holds, and fail if it does not within a generous time."""
+    """Wait until a condition holds, and fail after a generous time."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end

@@ -1,6 +1,6 @@
-"""Every public function and method, with arguments that it accepts, on one small scene.
+"""Every public function and method, with accepted arguments, on one small scene.
 
-`names()` lists the public surface; `CALLS` has a call for each of them.
+`names()` lists the public surface; `CALLS` has a call for each name.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HOMES = {
     "robots.": dc.robots,
     "residuals.": residuals,
 }
-# What is left out, and why.
+# Names without a call, and the reason.
 WITHOUT_CALL = {
     "learn.Ranks": "needs a group of processes",
     "learn.Ranks.close": "likewise",
@@ -77,7 +77,7 @@ def methods(owner: type) -> list[str]:
 
 @dataclass
 class Call:
-    """A function and what it is called with."""
+    """A function and its arguments."""
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...] = ()
@@ -117,7 +117,7 @@ class Inline(Executor):
 
 
 class World:
-    """What the calls need; made on first use, so that it is made under the same defaults."""
+    """Objects for the calls, made on first use and hence under the defaults of the call."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -338,7 +338,7 @@ def saving(w):
 
 
 def record(kind, w):
-    """A record of the package, made again from its fields."""
+    """Call that remakes a record of the package from its fields."""
     return call(kind, **{f.name: getattr(w, f.name) for f in fields(kind) if f.init})
 
 

@@ -9,9 +9,9 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def public(name: str) -> Path:
-    """A file or a folder of the data; where it is absent, the test is skipped, and fails in CI.
+    """Path of a file or folder of the data; without it the test is skipped, and fails in CI.
 
-    The reason has the first folder alone, so that pytest shows one line for each of them.
+    The reason contains only the first folder, so that pytest shows one line per folder.
     """
     path = DATA / name
     if not path.exists():

@@ -1,7 +1,7 @@
-"""Robot files of public packages, which tests find where these are installed.
+"""Robot files of public packages, for tests of installed packages.
 
-Only example-robot-data is in the extra `robots`. The others have requirements that nobody needs who
-reads their files; into a folder of its own, and without these, they come by
+Only example-robot-data is in the extra `robots`. The other packages have requirements that are not
+needed to read their files; to install them without requirements into a separate folder, run
 
     pip install --no-deps --target build/robots airo-models dexmate-urdf \\
         differentiable-robot-model example-robot-data hello-robot-stretch-urdf jvrc-description
@@ -30,7 +30,7 @@ PACKAGES = (
 
 @cache
 def robot_files(package):
-    """Paths of the URDF files of a package, none where it is not installed."""
+    """Paths of the URDF files of a package; empty if the package is not installed."""
     try:
         found = files(package) or []
     except PackageNotFoundError:
@@ -39,7 +39,7 @@ def robot_files(package):
 
 
 def robot_file(package, name):
-    """The file of a package whose path ends in a name; the test is skipped without the package."""
+    """The file of a package whose path ends in `name`; skips the test without the package."""
     found = robot_files(package)
     if not found:
         pytest.skip(f"needs the package {package}")
@@ -63,7 +63,7 @@ def under_a_cloth(robot, cells=8, size=0.1, gap=0.002, **keywords):
 
 
 def inside_its_limits(path, **keywords):
-    """A robot whose joints start a tenth of their range away from limits, and their ranges [J]."""
+    """A robot with joints at least a tenth of their range from limits, and the ranges [J]."""
     options = {"ignore_contact": "overlapping", "name": "robot"} | keywords
     mechanism = dc.Robot.load(path, **options).mechanism
     span = mechanism.upper - mechanism.lower

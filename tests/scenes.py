@@ -1,9 +1,8 @@
-"""Small scenes in known regimes of contact, and the step that leaves each of them.
+"""Small scenes in known regimes of contact, each with one step.
 
-Meshes are jittered: exact grids sit on kinks of the contact energy. Stiffnesses are low enough for
-finite differences. Every scene is warmed up until it is in the regime that its name says, so that
-friction, which lags one step behind, acts in the step at hand; what makes a regime is asserted in
-`test_step_gradients`, not assumed here.
+Meshes are jittered: exact grids are at kinks of the contact energy. Stiffnesses are low enough for
+finite differences. Every scene is warmed up until it is in the regime of its name, so that lagged
+friction acts in the step; `test_step_gradients` asserts the properties of each regime.
 """
 
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ CONTROL = ("pins", "soft_pins", "body_poses", "forces", "wind")
 
 @dataclass(frozen=True)
 class Case:
-    """One step: a simulator, a state, and what the control and the parameters replace.
+    """One step: a simulator, a state, and replaced controls and parameters.
 
     `control` and `parameters` map names to tensors.
     """
@@ -52,7 +51,7 @@ class Case:
         )
 
     def inputs(self) -> dict[str, torch.Tensor]:
-        """All differentiable inputs of the step by name: those of the state, control.*, ..."""
+        """All differentiable inputs of the step by name: state.*, control.*, parameters.*."""
         tensors = {f"state.{name}": getattr(self.state, name) for name in STATE}
         tensors |= {f"control.{name}": tensor for name, tensor in self.control.items()}
         names = [
@@ -100,9 +99,9 @@ def material(
     drag=0.0,
     woven=False,
 ):
-    """Values that differ from face to face, so that no gradient is spread by accident.
+    """Material with different values per face, to detect gradients that are wrongly spread.
 
-    `drag` is the share of that of a sheet in air; none by default, as momentum is then kept.
+    `drag` is relative to the drag of a sheet in air; zero by default, which conserves momentum.
     """
     rng = np.random.default_rng(seed)
 
@@ -132,7 +131,7 @@ def material(
 
 
 def warp(faces, woven, seed=21):
-    """Directions that differ from face to face; None where the cloth is not woven."""
+    """Different directions per face; None if the cloth is not woven."""
     return noise((len(faces), 3), 1.0, seed) * [1.0, 1.0, 0.1] if woven else None
 
 
@@ -273,12 +272,12 @@ def separating(**options):
 
 
 def landing(**options):
-    """No contact before the step, contact after it: friction begins in its second iteration."""
+    """No contact before the step, contact after: friction begins in the second iteration."""
     return on_box(0.5, (0.5, 0.2, -0.5), steps=0, above=0.011, **options)
 
 
 def leaving(**options):
-    """Contact before the step, none after it."""
+    """Contact before the step, none afterwards."""
     return on_box(0.5, (0.3, 0.1, 1.5), **options)
 
 
@@ -287,7 +286,7 @@ def thick(**options):
 
 
 def pushing(**options):
-    """A box that rises and turns under the sheet, and drags it."""
+    """A box that rises and rotates under the sheet, and drags the sheet."""
     return on_box(0.6, (0.2, 0.1, 0.0), moving=True, **options)
 
 
@@ -339,7 +338,7 @@ def folded(thickness=0.0, **options):
     rows, columns, edge = 5, 11, 0.08
     vertices, faces = grid(rows, columns, edge, seed=7)
     radius = 0.0045 + 0.5 * thickness
-    s = vertices[:, 0] - 0.04  # where the fold begins
+    s = vertices[:, 0] - 0.04  # distance from the beginning of the fold
     turn = np.pi * radius
     phi = np.clip(s, 0.0, turn) / radius
     over = np.maximum(s - turn, 0.0)
@@ -365,9 +364,9 @@ def folded(thickness=0.0, **options):
 
 
 def stacked(dragged=False, woven=False, **options):
-    """One cloth slides on another, softly pinned one; densities and thicknesses differ.
+    """A cloth slides on a softly pinned cloth; densities and thicknesses differ.
 
-    Where it is dragged, pins over the lower one move it. The lower one may be woven.
+    If `dragged`, pins move the upper cloth over the lower one. The lower one may be woven.
     """
     lower, faces = grid(6, 6, seed=11)
     upper, upper_faces = grid(5, 5, edge=0.09, seed=12)
@@ -455,7 +454,7 @@ REGIMES = {
 
 @cache
 def regime(name, scheme="coupled", metric=None, friction_iterations=2, integrator="implicit_euler"):
-    """A scene by name; made once."""
+    """A scene by name, cached."""
     return REGIMES[name](
         scheme=scheme,
         metric=metric,

@@ -71,7 +71,7 @@ PUSH = Short(
     ),
 )
 DYNAMIC = Short("hit_cloth_dynamic.yaml", tuple(SMALL))
-# A stiff cloth: a soft one that is squeezed flat buckles, one way or the other.
+# A stiff cloth, because a soft cloth that is squeezed flat buckles to either side.
 SMALL_CLOTH = (
     "scene.cloths.cloth.shape={kind: grid, rows: 6, columns: 6, size: 0.12}",
     "scene.cloths.cloth.material.bending=1e-2",

@@ -1,4 +1,4 @@
-"""The benchmark runs, and its scenes are what their names say. No test judges a time."""
+"""The benchmarks run, and their scenes are in the regimes of their names. No time is judged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDINARY = 7
-# One in air, one of woven cloth, one over a smooth ball, two with a gripper.
+# Including scenes in air, of woven cloth, over a smooth ball, and two with a gripper.
 SCENES = ORDINARY + 7
 
 
@@ -30,7 +30,7 @@ def ours(monkeypatch):
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
-    """Output and records of the quick form, in a process of its own: it sets torch's threads."""
+    """Output and records of the quick form, in a separate process: it sets torch's threads."""
     out = tmp_path_factory.mktemp("benchmarks") / "step.json"
     command = [sys.executable, "-m", "benchmarks.step", "--quick", "--json", str(out)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -131,7 +131,7 @@ def test_every_factorization_is_timed():
 
 
 @pytest.mark.slow
-def test_what_moves_by_forces_is_timed_beside_what_is_given():
+def test_dynamic_bodies_are_timed_beside_prescribed_ones():
     command = [sys.executable, "-m", "benchmarks.coupling", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
@@ -196,14 +196,14 @@ def test_the_page_of_figures_has_what_was_measured(figures):
 @pytest.mark.quick("hanging", "plane")
 @pytest.mark.parametrize("name", ["hanging", "plane", "sphere"])
 def test_our_side_of_a_peer(name):
-    """Gradients of rollouts at 60 Hz are those of their differences, and nothing sinks in."""
+    """Gradients of rollouts at 60 Hz match differences, and no vertex penetrates."""
     peers = importlib.import_module("benchmarks.peers")
     told = peers.scene(name, 6)
     found = peers.time_ours(told)
     assert len(found["frames"]) == peers.FRAMES + 1
     assert peers.gradient_error(found) < 1e-3
     assert peers.depth(told, found) == 0.0
-    # What judges can say no.
+    # The judges can fail.
     wrong = {**found, "slopes": [1.5 * slope for slope in found["slopes"]]}
     assert peers.gradient_error(wrong) > 5e-3
     if told["body"] is not None:
@@ -220,7 +220,7 @@ def test_our_side_of_a_peer_without_gradients(name):
     judged = peers.judge(told, found)
     assert (judged["crossings"], judged["inside"], judged["depth"]) == (0, 0, 0.0)
     assert 1.0 <= judged["stretch"] < 1.5
-    # What judges can say no: to an edge through the sheet, and to a sheet that is lower.
+    # The judges can fail: for an edge through the sheet, and for a lower sheet.
     if told["body"] is None:
         x = np.array(told["rest"])
         x[1, 2] += 0.1
@@ -235,7 +235,7 @@ def test_our_side_of_a_peer_without_gradients(name):
 
 @pytest.mark.slow
 def test_the_page_of_figures_is_that_of_its_records(tmp_path):
-    """Nobody has edited the page, nor forgotten to draw it again."""
+    """The page has no manual edits, and was redrawn after the last change of its records."""
     for name in ("performance.json", "performance.md"):
         (tmp_path / name).write_bytes((ROOT / "docs" / name).read_bytes())
     run_figures("--draw", "--docs", str(tmp_path))
@@ -281,7 +281,7 @@ def test_turns_are_those_of_links():
     t = np.linspace(0, 2 * np.pi, 13)
     ring = np.stack([np.cos(t), np.sin(t), 0 * t], axis=1)
     other = np.stack([1 + np.cos(t), 0 * t + 0.01, np.sin(t)], axis=1)
-    # Solid angles that add up to that of a sphere, but for rounding.
+    # Solid angles add up to the solid angle of a sphere, up to rounding.
     assert abs(linking(ring, other)) == pytest.approx(1, abs=1e-12)
     assert linking(ring, other[::-1]) == pytest.approx(-linking(ring, other), abs=1e-12)
     assert linking(ring, other + np.array([3, 0, 0])) == pytest.approx(0, abs=1e-12)
@@ -337,7 +337,7 @@ def test_crossings_are_those_of_triangles(monkeypatch):
 
 
 def pierces(a, b):
-    """Whether an edge of triangle `a` passes through triangle `b`."""
+    """Return whether an edge of triangle `a` passes through triangle `b`."""
     for p, q in ((a[0], a[1]), (a[1], a[2]), (a[2], a[0])):
         # p + t (q - p) = b0 + u (b1 - b0) + v (b2 - b0)
         matrix = np.stack([p - q, b[1] - b[0], b[2] - b[0]], axis=1)
@@ -370,7 +370,7 @@ def test_the_baseline_is_timed_with_both_elastic_solvers():
     ],
 )
 def test_a_missing_extra_is_named_in_a_sentence(benchmark, module, sentence):
-    """None in sys.modules is how Python itself marks a module that is not to be found."""
+    """None in sys.modules makes Python's import of the module fail."""
     code = (
         f"import runpy, sys; sys.modules[{module!r}] = None; "
         f"runpy.run_module('benchmarks.{benchmark}', run_name='__main__')"
@@ -400,7 +400,7 @@ def test_jumps_are_counted():
 
 
 def test_an_end_that_is_elsewhere_is_a_jump(monkeypatch):
-    """With a threshold below what starts differ by, every start jumps."""
+    """With a threshold below the differences of starts, every start jumps."""
     branches = importlib.import_module("benchmarks.branches")
     monkeypatch.setattr(branches, "JUMP", 1e-13)
     count = branches.count_jumps("crumple", 8, 2, 2, (1e-9, 1e-7))
@@ -431,7 +431,7 @@ def test_bits_are_the_same_twice_and_others_in_another_scheme():
     lines = [line.split() for line in runs[0].stdout.splitlines()]
     # Three schemes and a batch; without `projective` woven and damped cloth and a smooth ball.
     assert len(lines) == 13
-    # At this size the sheet may have left the ball, so that two schemes agree.
+    # At this size the sheet may have left the ball; then two schemes agree.
     assert len({line[-2] for line in lines}) >= 3
     assert len({line[-1] for line in lines}) >= 3
 

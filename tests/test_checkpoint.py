@@ -212,7 +212,7 @@ def mutated(value, generator):
 
 
 def bits(value):
-    """All numbers and texts of a content, to compare two of them."""
+    """All numbers and texts of a content, for comparison."""
     if isinstance(value, torch.Tensor):
         return [str(value.dtype), tuple(value.shape), value.numpy().tobytes()]
     if isinstance(value, dict):
@@ -223,7 +223,7 @@ def bits(value):
 
 
 def refusal(function, *arguments, **options):
-    """The message of the `InvalidInput` that a call raises, empty if it raises none."""
+    """Message of the `InvalidInput` that a call raises; empty without an error."""
     try:
         function(*arguments, **options)
     except InvalidInput as error:
@@ -260,7 +260,7 @@ class TestTrainer:
                 assert message.startswith(f"Trainer.load: {file}")
                 assert bits(record_of(other)) == before
             else:
-                # Other numbers in the right places: the training goes on, or says why it cannot.
+                # Other numbers in the right places: the training continues or raises its reason.
                 with contextlib.suppress(InvalidInput, dc.SimulationError):
                     other.update()
                 other = self.trainer()
@@ -285,7 +285,7 @@ POINTS = torch.linspace(0, 1, 9, dtype=F64)
 
 
 def residuals(parameters, values):
-    """Of a line; its slope must not be negative."""
+    """Residuals of a line; its slope must not be negative."""
     if values["slope"] < 0:
         raise dc.SimulationError("a negative slope")
     return values["slope"] * POINTS + values["offset"] - 2 * POINTS - 1
@@ -391,7 +391,7 @@ def finished(tmp_path_factory):
 
 
 class TestCommands:
-    """What `--resume` does with any content of `resume.pt`."""
+    """Behavior of `--resume` with arbitrary content of `resume.pt`."""
 
     @COUNTS
     @pytest.mark.parametrize("command", ["train", "fit", "optimize"])

@@ -1,4 +1,4 @@
-"""The command line: what it writes, and how it ends."""
+"""The command line: its files, messages and exit status."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_saved_states_are_exported(call, tmp_path):
     assert call("export", "states.pt", "states.npz", "--overwrite").exit_code == 0
 
 
-def test_one_environment_of_a_batch_is_exported(call):
+def test_a_single_environment_of_a_batch_is_exported(call):
     simulator = Simulator(dc.Scene([dc.Cloth.grid(2, 2, name="sheet")]), 0.01)
     states = simulator.rollout(simulator.initial_state(2), steps=2)
     states.save("batch.pt")
@@ -224,8 +224,8 @@ def test_the_module_runs():
         pytest.param(["run", "x.yaml", "--sett", "y"], 2, id="misspelled"),
     ],
 )
-def test_what_needs_no_simulation_reads_no_torch(arguments, code):
-    """It takes seconds to import."""
+def test_commands_without_simulation_import_no_torch(arguments, code):
+    """Importing torch needs seconds."""
     script = (
         "import sys\n"
         "from diffcloth_torch.cli import main\n"
@@ -247,7 +247,7 @@ def test_the_commands_import_nothing_that_only_pictures_need():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- results that are there already -------------------------------------------------------------
+# --- existing results ---------------------------------------------------------------------------
 
 
 def test_results_are_not_overwritten_unless_told(call, tmp_path):
@@ -302,7 +302,7 @@ class Interrupt:
         def interrupted(real):
             def step(*args, **kwargs):
                 taken.append(1)
-                if len(taken) == before + 1:  # once: the run that resumes takes all its steps
+                if len(taken) == before + 1:  # once: the resumed run completes all its steps
                     raise KeyboardInterrupt
                 return real(*args, **kwargs)
 
@@ -313,7 +313,7 @@ class Interrupt:
 
 
 def results(folder):
-    """What two runs have in common to the bit: no seconds."""
+    """Results that two runs share to the bit; times are omitted."""
     metrics = json.loads((folder / "metrics.json").read_text())
     with np.load(folder / "actions.npz") as arrays:
         actions = {name: arrays[name].tobytes() for name in arrays.files}
@@ -367,7 +367,7 @@ def test_a_finished_optimization_takes_more_iterations(call, tmp_path):
         ),
     ],
 )
-def test_what_cannot_be_resumed(call, tmp_path, arguments, message):
+def test_a_bad_resumption_is_refused(call, tmp_path, arguments, message):
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/resume.pt").write_bytes(b"no such thing")
     (tmp_path / "good").mkdir()
@@ -387,7 +387,7 @@ def test_resume_takes_the_rest_from_its_folder(call):
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_configuration_comes_back_from_its_record(path):
-    if path.stem.startswith("train_"):  # of `diffcloth train`, with a schema of its own
+    if path.stem.startswith("train_"):  # of `diffcloth train`, with a separate schema
         config = validate(TrainConfig, read_document(path), path)
         assert validate(TrainConfig, config.model_dump(mode="json"), path) == config
         return
@@ -446,7 +446,7 @@ with locked("hold", Path(sys.argv[1])):
 
 
 @pytest.mark.parametrize("name", ["resume.pt", "metrics.json", "actions.npz", "events"])
-def test_something_in_the_place_of_results_is_refused(call, tmp_path, name):
+def test_an_obstacle_in_the_place_of_results_is_refused(call, tmp_path, name):
     (tmp_path / "out").mkdir()
     if name == "events":
         (tmp_path / "out/events").touch()
@@ -568,7 +568,7 @@ def test_actions_that_claim_more_than_there_is_take_no_memory(
 
 @pytest.mark.parametrize("command", ["run", "optimize"])
 def test_actions_on_a_pipe_are_refused(call, tmp_path, command):
-    """Nobody writes to it: reading it would wait without end."""
+    """The pipe has no writer: reading would wait forever."""
     os.mkfifo(tmp_path / "pipe.npz")
     arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--actions", "pipe.npz", "--out", "out"]
     result = call(command, *arguments)
@@ -576,7 +576,7 @@ def test_actions_on_a_pipe_are_refused(call, tmp_path, command):
     assert "pipe.npz: must be a regular file" in one_sentence(result)
 
 
-# --- what stands where results go -----------------------------------------------------------------
+# --- obstacles in the place of results ------------------------------------------------------------
 
 
 @pytest.fixture
@@ -611,7 +611,7 @@ def test_a_file_named_like_a_folder_of_results_is_refused_before_the_work(call, 
 
 
 @pytest.mark.parametrize("name", ["actions.pt", "loss.png", "metrics.json"])
-def test_a_folder_in_what_is_resumed_is_refused_before_the_work(call, tmp_path, name, monkeypatch):
+def test_a_folder_in_resumed_results_is_refused_before_the_work(call, tmp_path, name, monkeypatch):
     arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--set=optimizer.iterations=1"]
     assert call("optimize", *arguments, "--out", "out").exit_code == 0
     (tmp_path / "out" / name).unlink()

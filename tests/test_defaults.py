@@ -1,4 +1,4 @@
-"""What torch's default device and dtype are changes no result of any public function or method."""
+"""Torch's default device and dtype change no result of any public function or method."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGE = Path(dc.__file__).parent
 
 
 class Elsewhere(TorchFunctionMode):
-    """A mode of a caller that makes what names no device on another one."""
+    """A mode of a caller that makes tensors without an explicit device on another device."""
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
@@ -83,7 +83,7 @@ FORMS = {
     "both": lambda: several(torch.device("meta"), default_dtype(torch.float16)),
 }
 QUICK = ("set_default_device", "own mode", "both")
-# Times, and what has no numbers.
+# Fields with times, or without numbers.
 OMITTED = {
     "seconds",
     "make_env",
@@ -101,7 +101,7 @@ def is_omitted(name):
 
 
 def content(value):
-    """The numbers of a result, with their types, in an order; of what has none, its text."""
+    """Numbers of a result with their types, in a fixed order; text for values without numbers."""
     if isinstance(value, torch.Tensor):
         assert value.device.type == "cpu"
         value = value.detach().resolve_neg()
@@ -126,7 +126,7 @@ def content(value):
 
 
 def result(world, name):
-    """What a call returns, and the mesh and the picture that it writes: other files have times."""
+    """Result of a call, and the mesh and picture that it writes; other files contain times."""
     paths = [world.folder / "state.obj", world.folder / "picture.png"]
     for path in paths:
         path.unlink(missing_ok=True)
@@ -136,7 +136,7 @@ def result(world, name):
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    """World by form; that of None has torch's own defaults."""
+    """World by form of the defaults; None: torch's own defaults."""
     made = {}
 
     def of(form):
@@ -238,7 +238,7 @@ def test_policies_and_their_optimizers(same, world, algorithm, tmp_path):
 
 @pytest.mark.parametrize("where", ["inside", "outside", "another thread"])
 def test_gradients_wherever_backward_runs(world, where):
-    """Of steps, of a checkpointed rollout and of an equilibrium, which solves in backward."""
+    """Gradients of steps, a checkpointed rollout and an equilibrium (which solves in backward)."""
     sim, hung = world(None).sim, world(None).hung
 
     def gradient(form):
@@ -301,7 +301,7 @@ def test_compiled_steps(world):
 
 
 def test_functions_of_a_caller_follow_the_callers_defaults(world):
-    """What a callback makes without a device is where the caller wants it."""
+    """Tensors that a callback makes without a device are on the caller's default device."""
     sim, made = world(None).hung, []
 
     def control(k, state):
@@ -312,7 +312,7 @@ def test_functions_of_a_caller_follow_the_callers_defaults(world):
     assert made == ["meta"]
 
 
-# --- How it is done -------------------------------------------------------------------------------
+# --- Implementation: explicit device and dtype ----------------------------------------------------
 
 # Functions of torch that take the default device or dtype, unless both are named.
 MAKERS = {f.__name__ for f in _device_constructors()} | {"Generator", "Tensor", "FloatTensor"}

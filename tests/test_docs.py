@@ -1,4 +1,4 @@
-"""The documentation points at what exists, and its formulas are those of the code."""
+"""Links and names of the documentation exist, and its formulas match the code."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_files_that_are_named_exist(page):
     for path in re.findall(
         r"`((?:\.ci|configs|docs|examples|scripts|tests)/[\w./-]*\w)`", page.read_text()
     ):
-        if path != "tests/oracles":  # where such references go
+        if path != "tests/oracles":  # named as a possible place for references
             assert (ROOT / path).exists(), path
 
 
@@ -72,7 +72,7 @@ def test_the_reference_has_every_name_of_a_module(module):
 
 
 def test_the_stand_in_of_the_core_is_like_the_core():
-    """The site is built with what `_core.pyi` declares in its place."""
+    """The site is built with the declarations of `_core.pyi` instead of the core."""
     declarations = ROOT / "diffcloth_torch" / "_core.pyi"
     found = importlib.util.spec_from_file_location("core_stub", ROOT / "docs" / "core_stub.py")
     core_stub = importlib.util.module_from_spec(found)
@@ -112,7 +112,7 @@ def test_the_gallery_shows_every_picture_that_a_configuration_makes():
     ],
 )
 def test_a_newcomers_word_stands_in_a_heading(word, page):
-    """The search of the site lists pages first whose headings have what is asked for."""
+    """The site's search ranks pages with the word in a heading first."""
     headings = re.findall(r"^#+ (.+)$", (ROOT / "docs" / page).read_text(), re.MULTILINE)
     assert any(word.lower() in heading.lower() for heading in headings)
 
@@ -143,7 +143,7 @@ def test_resting_gap_is_that_of_the_guide():
     above = rest + np.array([0, 0, 0.004])
     cloth = dc.Cloth(above, grid.faces, rest_positions=rest, material=dc.Material(bending=1e-2))
     contact = dc.ContactOptions(barrier_distance=0.005, barrier_stiffness=20.0)
-    # Off its diagonal, whose contacts with edges of the sheet would carry a part.
+    # Away from the plane's diagonal, whose contacts with edges of the sheet would carry a part.
     floor = dc.RigidBody.plane(50.0, pose=[9, 0, 0, 1, 0, 0, 0])
     simulator = dc.Simulator(dc.Scene([cloth], [floor]), 0.02, contact=contact)
     with torch.no_grad():
@@ -160,7 +160,7 @@ def test_resting_gap_is_that_of_the_guide():
 
 @pytest.mark.parametrize("load", [0.0, 0.5, 0.9])
 def test_creep_is_that_of_the_guide(load):
-    """A sheet on a floor, pulled sideways by a share of what friction can bear."""
+    """A sheet on a floor, pulled sideways by a share of the largest friction."""
     friction, slip = 0.5, 1e-3
     cloth = dc.Cloth.grid(3, 3, 0.1, pose=[0, 0, 0.003, 1, 0, 0, 0])
     contact = dc.ContactOptions(barrier_distance=0.004, slip_velocity=slip)
@@ -221,7 +221,7 @@ def as_a_reader(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("page", "line", "code"), list(python_blocks()))
 @pytest.mark.usefixtures("as_a_reader")
 def test_every_block_of_python_runs_alone(page, line, code):
-    """Pasted into a fresh interpreter: it imports what it uses."""
+    """A block runs in a fresh interpreter: it contains its own imports."""
     if "dc.render" in code:
         pytest.importorskip("pyvista")
         pytest.importorskip("imageio_ffmpeg")
@@ -236,8 +236,8 @@ def test_every_block_of_python_runs_alone(page, line, code):
     exec(compile("\n" * line + code, str(page), "exec"), {"__name__": "__main__"})
 
 
-def test_one_sheet_takes_one_amount_of_memory():
-    """Of the sheet of a slow test in tests/solver, wherever it is told, to a digit."""
+def test_pages_agree_on_the_memory_of_the_hanging_sheet():
+    """All pages state one amount for the sheet of a slow test in tests/solver."""
     told = []
     for page in PAGES:
         text = " ".join(page.read_text().split())

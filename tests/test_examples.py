@@ -1,4 +1,4 @@
-"""The examples run as a reader would run them, and reach what they promise."""
+"""The examples run as a reader would run them, and reach their stated results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# What users start from is not thrown by the barrier.
+# The barrier must not throw the cloth in start states.
 pytestmark = pytest.mark.filterwarnings(
     "error::diffcloth_torch.BarrierStartWarning", "error:Cloth.grid:FutureWarning"
 )
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings(
 
 @pytest.fixture
 def own_mesh(tmp_path):
-    """An unstructured sheet in a file of its own; tilted, so that it lands on one side first."""
+    """File of an unstructured sheet, tilted so that one side lands first."""
     grid = dc.Cloth.grid((8, 7), (0.3, 0.35))
     x, y = grid.vertices[:, 0], grid.vertices[:, 1]
     jitter = np.random.default_rng(0).uniform(-0.008, 0.008, grid.vertices.shape)
@@ -42,7 +42,7 @@ def own_mesh(tmp_path):
 
 
 def example_of_the_readme():
-    """The longer of its blocks."""
+    """The longest Python block of the README."""
     return max(
         re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL), key=len
     )
@@ -69,10 +69,10 @@ def test_a_finger_feels_a_pen_through_a_cloth(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["tactile_image.py", str(path)])
     names = runpy.run_path(str(ROOT / "examples/tactile_image.py"), run_name="__main__")
     image, force = names["image"].numpy(), float(names["pressing"].normal_forces.sum())
-    # At rest, the drive's effort is what presses; little of it is spread beyond the pad.
+    # At rest, the drive's effort is the pressing force; little of it is beyond the pad.
     assert force == pytest.approx(names["EFFORT"], rel=0.1)
     assert image.sum() * names["PIXEL"] ** 2 == pytest.approx(force, rel=0.2)
-    # Where it is pressed hardest, row by row, is a line as steep as the pen.
+    # The points of highest pressure, row by row, form a line with the slope of the pen.
     rows = image.max(axis=1) > 0.3 * image.max()
     z, x = np.flatnonzero(rows), image.argmax(axis=1)[rows]
     assert len(z) > 20
@@ -88,7 +88,7 @@ def test_a_motor_lifts_what_its_limits_allow(capsys):
     assert (angles[:3] > 0.9).all()
     assert names["fastest"][1] < 1.01  # of the slow one
     assert names["fastest"][0] > 3.9
-    # The weak one hangs where the weight, which turns it by W cos q, is at its limit.
+    # The weak arm hangs at the angle at which the moment of its weight, W cos q, is at its limit.
     assert float(state.joint_efforts[3]) == pytest.approx(0.5, abs=2e-3)
     slope = 1.0 / (0.5 * math.tan(-float(angles[3])))
     assert float(names["limits"].grad[3]) == pytest.approx(slope, rel=0.1)
@@ -100,7 +100,7 @@ def test_a_figure_walks_under_a_sheet(capsys):
     names = runpy.run_path(str(ROOT / "examples/walker.py"))
     states, simulator = names["states"], names["simulator"]
     figure = states[-1].positions[simulator.slices["walker"]]
-    # The sheet has come along, draped: it is as far as the figure, and reaches below its trunk.
+    # The draped sheet has moved with the figure, and reaches below its trunk.
     assert names["mean"][0].item() == pytest.approx(figure[:, 0].mean().item(), abs=0.02)
     assert names["mean"][0] > 0.4
     assert names["cloth"][:, 2].min() < 0.43
@@ -119,7 +119,7 @@ def test_own_mesh(own_mesh, monkeypatch, capsys):
 
 
 def test_script_says_no_more_than_it_prints(own_mesh):
-    """At the end of a script objects of the core still live; nanobind used to call them leaked."""
+    """Objects of the core live until the end of a script; nanobind once reported leaks."""
     command = [sys.executable, str(ROOT / "examples/own_mesh.py"), str(own_mesh)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
@@ -136,7 +136,7 @@ def test_example_of_the_readme(own_mesh, monkeypatch):
 
 @pytest.mark.slow
 def test_example_of_the_readme_on_meshes_of_any_size():
-    """From 30 cm to 70 m: it falls on the floor, stays, and slides less with more friction."""
+    """Meshes of 30 cm to 70 m fall onto the floor, stay, and slide less with more friction."""
     code = example_of_the_readme()
     meshes = sorted(public("cloth").glob("*.obj"))
     assert len(meshes) >= 5
@@ -147,7 +147,7 @@ def test_example_of_the_readme_on_meshes_of_any_size():
         assert 0 < names["loss"].item() < 20 * 0.01 * 0.5, mesh
         assert names["throw"].grad[0] > 0.01, mesh
         assert names["friction"].grad < -1e-4, mesh
-        # The barrier does not push it away.
+        # The barrier does not push the cloth away.
         assert names["end"].velocities[:, 2].mean() < 0.01, mesh
 
 
@@ -168,7 +168,7 @@ def test_optimize_push(capsys):
 @pytest.mark.rounding
 def test_fit_friction():
     names = runpy.run_path(str(ROOT / "examples/fit_friction.py"))
-    # Of the data, but for the time step; the first guess is 0.1.
+    # The value of the data, up to the error of the time step; the first guess is 0.1.
     assert names["friction"] == pytest.approx(names["FRICTION"], rel=0.1)
     assert names["found"].best.loss < 1e-3 * names["found"].first.loss
 
@@ -190,7 +190,7 @@ def plan_grasp():
     return ROOT / "examples/plan_grasp.py"
 
 
-def test_gradients_flow_through_a_plan_and_what_it_does(plan_grasp):
+def test_gradients_flow_through_a_plan_and_its_motion(plan_grasp):
     names = runpy.run_path(str(plan_grasp))
     way = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64, requires_grad=True)
     states = names["carry_out"]({"way": way})
@@ -233,7 +233,7 @@ def test_a_cloth_falls_on_public_robots(name):
 
 def test_drape_own_mesh(own_mesh, tmp_path):
     body, out = tmp_path / "ball.obj", tmp_path / "draped.obj"
-    # The sheet hangs low at its corners, 2 cm at most: the ball below is clear of it.
+    # The sheet hangs lowest at its corners, 2 cm at most: the ball below is clear of the sheet.
     ball = dc.RigidBody.sphere(0.1, subdivisions=2)
     lines = [f"v {a} {b} {c - 0.14}\n" for a, b, c in ball.vertices]
     lines += [f"f {a} {b} {c}\n" for a, b, c in ball.faces + 1]

@@ -1,4 +1,4 @@
-"""Named fabrics: their numbers are those of the measurements, and each of them is a cloth."""
+"""Named fabrics: their numbers match the measurements, and each fabric makes a cloth."""
 
 from typing import get_args
 
@@ -14,13 +14,13 @@ from diffcloth_torch.model.orthotropy import check_bending
 NAMES = list(dc.fabrics.MEASUREMENTS)
 
 
-def test_there_are_eight_and_configurations_know_them():
+def test_configurations_know_all_eight_fabrics():
     assert len(NAMES) == 8
     assert list(get_args(Fabric)) == NAMES
 
 
 def test_the_conversion_is_that_of_the_page():
-    """Of denim, by hand."""
+    """Expected values of denim computed by hand."""
     denim = dc.fabrics.material("denim")
     assert denim.density == 0.324
     assert (denim.stretch, denim.stretch_weft) == (1013.88629, 205.352005)
@@ -36,7 +36,7 @@ def test_a_quarter_is_the_stiffness_of_a_plate_of_hinges_on_equilateral_triangle
     """
     side, c, k = 1e-2, 0.1, 1.0
     height = np.sqrt(0.75) * side
-    area = height * side  # of two faces, and of what belongs to a vertex
+    area = height * side  # area of two faces, and of one vertex
     corners = np.array([[0.0, 0.0], [side, 0.0], [side / 2, height], [side / 2, -height]])
     for bent in np.linspace(0.0, np.pi, 7):
         energy = 0.0
@@ -48,7 +48,7 @@ def test_a_quarter_is_the_stiffness_of_a_plate_of_hinges_on_equilateral_triangle
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_is_a_woven_cloth_that_moves(name):
+def test_every_fabric_is_a_woven_cloth_that_moves(name):
     material = dc.fabrics.material(name, thickness=1e-4)
     assert material.is_orthotropic
     assert material.thickness == 1e-4
@@ -65,7 +65,7 @@ def test_each_is_a_woven_cloth_that_moves(name):
     assert state.positions[-1, 2] < -1e-3
 
 
-def test_an_unknown_one_is_refused():
+def test_an_unknown_fabric_is_refused():
     with pytest.raises(dc.InvalidInput, match=r"fabrics.material: `name` must be .*denim"):
         dc.fabrics.material("tweed")
     with pytest.raises(dc.InvalidInput, match="`fabric` must be "):

@@ -1,4 +1,4 @@
-"""A few random scenes in the tests; `scripts/fuzz` runs more of them for as long as one likes."""
+"""A few random scenes in the tests; `scripts/fuzz` runs any number of scenes."""
 
 import importlib.util
 import re
@@ -29,7 +29,7 @@ def fuzz(*arguments):
 
 
 def numbers(text):
-    """What does not depend on the clock."""
+    """The text without times."""
     return re.sub(r" in \d+ s", "", text)
 
 
@@ -57,7 +57,7 @@ def test_exact_directions_that_single_precision_turns_are_computed_again():
 
 
 def test_every_second_scene_is_a_tower():
-    """The others are what they were when cloths alone moved."""
+    """The other scenes equal earlier ones, in which only cloths moved."""
     drawings = fuzz_main.DRAWINGS
     for index, name in enumerate(("towers", "cloths", "towers", "cloths")):
         drawn = drawings["all"](6, index).description
@@ -84,7 +84,7 @@ def test_towers_are_of_every_kind():
 
 
 def test_the_fuzz_sees_what_is_wrong():
-    """Its judges are of use only where they say what is wrong."""
+    """Judges are useful only if they detect errors."""
     scene = next(s for s in (draw_tower(1, i) for i in range(60)) if s.drives is not None)
     tally = fuzz_main.Tally(show_failures=False)
     before, where = scene.start, {"step": 0}
@@ -115,7 +115,7 @@ def test_attachments_are_of_every_kind():
 
 
 def test_the_fuzz_sees_a_target_that_pulls_wrongly():
-    """The momentum of cloths counts what targets pull, computed by hand."""
+    """The momentum balance of cloths includes the forces of targets, computed by hand."""
     draws = (fuzz_main.DRAWINGS["cloths"](1, index) for index in range(60))
     scene = next(
         s
@@ -134,7 +134,7 @@ def test_the_fuzz_sees_a_target_that_pulls_wrongly():
 
 
 def test_the_fuzz_sees_air_that_pushes_wrongly():
-    """The momentum of cloths counts what the air does, computed by hand, in gusts too."""
+    """The momentum balance of cloths includes air forces, computed by hand, also in gusts."""
     draws = [fuzz_main.DRAWINGS["cloths"](1, index) for index in range(60)]
     windy = [s for s in draws if s.air.wind is not None and not len(s.simulator._assembly.pins)]
     scene = next(s for s in windy if s.air.normal_drag > 0.2)
@@ -161,7 +161,7 @@ def test_the_extent_of_a_run_must_be_given():
 
 
 def points_on_branches(factor):
-    """(t, value, slope times a factor), zero alone on its branch, neighbors on different ones."""
+    """Points (t, value, slope times `factor`): t = 0 on a branch alone, neighbors on others."""
     branches = [lambda t: (np.exp(3 * t), 3), lambda t: (2 + np.sin(t), 1), lambda t: (5 - t, -1)]
     found = {0.0: 0, 1e-4: 1, 1e-8: 2, -1e-4: 1, 1e-6: 2, -1e-8: 1, -1e-6: 2}
     return [
@@ -172,7 +172,7 @@ def points_on_branches(factor):
 
 
 def test_slopes_are_judged_on_their_own_branch():
-    # A slope of 1 instead of cos(t), and what rounding leaves of differences over 1e-4.
+    # The error is a slope of 1 instead of cos(t), and rounding of differences over 1e-4.
     assert slope_error(points_on_branches(1.0)) < 1e-7
 
 
@@ -190,7 +190,7 @@ def test_slopes_that_are_no_numbers_are_not_right():
 @pytest.mark.slow
 @pytest.mark.rounding
 def test_a_gradient_where_a_step_has_several_minima_is_not_suspect():
-    """A stiff sheet, thrown without gravity: changes of 1e-9 make it buckle in other ways."""
+    """A stiff sheet, thrown without gravity: changes of 1e-9 change its buckling mode."""
     result = fuzz("--seed", "3", "--only", "23")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "suspect gradients 0 of 1 checked" in result.stdout

@@ -1,4 +1,4 @@
-"""The level of instructions: who chooses it, what is refused, and which levels differ in bits."""
+"""The level of instructions: its choice, refused values, and levels with different bits."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Commands that are killed at random moments, once or twice, and go on: the same bits."""
+"""Commands killed at random moments, once or twice, resume with the same bits."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ UNCERTAIN = (
 
 
 def called(arguments):
-    """Run the command in a process of its own, which has imported everything before."""
+    """Run the command in a separate process with all imports preloaded."""
     torch.set_num_threads(1)
     with open(os.devnull, "w") as null:  # noqa: PTH123
         os.dup2(null.fileno(), 1)
@@ -85,7 +85,7 @@ def called(arguments):
 
 @pytest.fixture(scope="module")
 def context():
-    """Processes that begin in milliseconds, so that most of their time is that of the command."""
+    """Processes that start in milliseconds, so that most of their time is the command's."""
     found = multiprocessing.get_context("forkserver")
     found.set_forkserver_preload(
         ["diffcloth_torch.cli.train", "diffcloth_torch.cli.fit", "diffcloth_torch.cli.optimize",

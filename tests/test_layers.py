@@ -1,4 +1,4 @@
-"""Dependencies point one way: between the folders of csrc/, and between the modules in Python."""
+"""Dependencies have one direction: between folders of csrc/, and between Python modules."""
 
 import ast
 import re
@@ -42,7 +42,7 @@ def includes(text: str) -> list[str]:
 
 
 def not_below(unit: str, targets: dict[str, str], layers: list[set[str]]) -> list[str]:
-    """Those of the includes, path -> unit, that are neither of a unit itself nor of a lower row."""
+    """Includes (path -> unit) that belong neither to the unit itself nor to a lower row."""
     rank = {name: row for row, names in enumerate(layers) for name in names}
     return [
         path
@@ -63,7 +63,7 @@ def forbidden_in_step(unit: str, text: str) -> list[str]:
 
 
 def step_unit(path: Path) -> str:
-    """Of a path in csrc: the folder in csrc/step, or the file in its root."""
+    """Unit of a path in csrc: the folder in csrc/step, or the file in its root."""
     return path.with_suffix("").parts[1]
 
 
@@ -115,7 +115,7 @@ def test_only_bind_knows_python():
 
 
 def names_of_the_package(text: str) -> list[str]:
-    """Names that a module imports from the package itself and that are no modules of it."""
+    """Names that a module imports from the package itself, except submodules."""
     wanted = re.findall(r"^\s*from diffcloth_torch import (\([^)]*\)|.*)$", text, re.MULTILINE)
     names = [
         name.split()[0] for line in wanted for name in line.strip("()").split(",") if name.strip()
@@ -125,7 +125,7 @@ def names_of_the_package(text: str) -> list[str]:
 
 
 def test_modules_import_only_the_core_from_the_package_itself():
-    """Import contracts ignore imports of the package itself, which stand for the core."""
+    """Import contracts ignore imports from the package itself; these may only be the core."""
     for path in (ROOT / "diffcloth_torch").rglob("*.py"):
         text = path.read_text()
         assert set(names_of_the_package(text)) <= {"_core"}, path
@@ -136,14 +136,14 @@ def test_modules_import_only_the_core_from_the_package_itself():
 PRIVATE = re.compile(r"(?<!diffcloth_)\b(torch|forward_ad)(\.\w+)*\._[a-zA-Z]")
 
 
-def test_one_module_uses_undocumented_torch():
+def test_a_single_module_uses_undocumented_torch():
     package = ROOT / "diffcloth_torch"
     users = {p.relative_to(package) for p in package.rglob("*.py") if PRIVATE.search(p.read_text())}
     assert users == {Path("autograd/torch_private.py")}
 
 
 UNPICKLERS = {
-    # Read files: what a file holds must not run.
+    # Read files: the content of a file must not run.
     "diffcloth_torch/checkpoint.py": {"torch.load"},
     "diffcloth_torch/sim/records/trajectory.py": {"torch.load"},
     "benchmarks/branches.py": {"torch.load"},

@@ -38,7 +38,7 @@ def test_a_step_of_a_long_rollout_costs_as_much_as_one_of_a_short_one():
     sim = hanging()
     pulled(sim, 20, 10)
     times = {steps: min(pulled(sim, steps, 50)[1] for _ in range(2)) for steps in (250, 2000)}
-    # Measured 1.0; a cost that grows with the steps would give 8.
+    # Measured 1.0; a cost proportional to the steps would be 8.
     assert times[2000] / 2000 < 2 * times[250] / 250
     torch.testing.assert_close(pulled(sim, 100, 7)[0], pulled(sim, 100, None)[0], rtol=0, atol=0)
 

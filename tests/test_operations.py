@@ -1,7 +1,7 @@
-"""A message begins with the operation that was called, for all of the public surface.
+"""An error message begins with the called operation, for the whole public surface.
 
-Each argument of each call is replaced in turn by values of a wrong type, shape, dtype, by numbers
-that are not finite, and by tensors on another device. What is refused is refused by name.
+Each argument of each call is replaced in turn by values of a wrong type, shape or dtype, by numbers
+that are not finite, and by tensors on another device. A refusal names the operation.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def is_numbers(value):
 
 
 def mistakes(call):
-    """Each call with one wrong argument."""
+    """The call with each argument in turn replaced by wrong values."""
     for i, value in enumerate(call.arguments):
         for kind, wrong in spoiled(value):
             arguments = (*call.arguments[:i], wrong, *call.arguments[i + 1 :])
@@ -82,7 +82,7 @@ def mistakes(call):
             yield f"{key} {kind}", dataclasses.replace(call, keywords={**call.keywords, key: wrong})
 
 
-# What the package or torch calls, with what was checked or made before, and what a list does.
+# Functions that the package or torch calls with checked arguments, and functions of lists.
 INNER = {
     "Cloth.material_axes",
     "DeformingBody.material_axes",
@@ -127,7 +127,7 @@ INNER = {
     "learn.Policy.forward",
     "learn.TrainerOptions.rate_share",
 }
-# What takes no argument, and records, whose fields are checked where they are used.
+# Functions without arguments, and records, whose fields are checked on use.
 WITHOUT_REFUSAL = {
     "ContactPoints",
     "Control",
@@ -170,7 +170,7 @@ WITHOUT_REFUSAL = {
     "learn.Trainer.update",
     "robots.panda",
 }
-# Where neither the name nor that of the class opens a message.
+# Openings of messages that begin neither with the name nor with its class.
 OPENINGS = {
     "State.__getitem__": ("state[i]",),
     "envs.Task": ("FoldCloth",),
@@ -196,7 +196,7 @@ def test_lists_name_public_operations_once():
 
 
 def refusal(function):
-    """The message with which the package refuses a call; None if it does not."""
+    """Message with which the package refuses a call; None if the call is accepted."""
     try:
         function()
     except (dc.InvalidInput, dc.SimulationError, TypeError) as error:
@@ -215,7 +215,7 @@ def test_refusals_open_with_the_operation(world, name, recwarn):
     assert bool(refused) == (name not in WITHOUT_REFUSAL)
 
 
-# --- Which operation it is ------------------------------------------------------------------------
+# --- Named operation ------------------------------------------------------------------------------
 
 
 def lost(state):

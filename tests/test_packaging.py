@@ -1,4 +1,4 @@
-"""What is installed: versions, the C++ core on its own, the command, the typing marker."""
+"""The installed package: versions, the C++ core alone, the command, the typing marker."""
 
 import importlib.metadata
 import importlib.resources
@@ -19,7 +19,7 @@ PYPROJECT = (ROOT / "pyproject.toml").read_text()
 
 
 def printed(code: str) -> str:
-    # Not from ROOT, where an import would find the sources instead of what is installed.
+    # Not from ROOT, where an import would find the sources instead of the installed package.
     return run_python(code, cwd=Path(__file__).parent).strip()
 
 
@@ -76,7 +76,7 @@ def test_a_wheel_carries_its_licenses():
 
 
 def test_a_step_is_taken():
-    """The one that a fresh environment needs no data for: wheels are tested by it."""
+    """A step without data: this test runs in fresh environments to check wheels."""
     code = """
 import torch, diffcloth_torch as dc
 cloth = dc.Cloth.grid(5, 5, 0.3, pose=[0, 0, 0.002, 1, 0, 0, 0])
@@ -97,7 +97,7 @@ def test_sources_without_a_core_say_what_to_do(tmp_path):
         sources,
         ignore=shutil.ignore_patterns("*.so", "__pycache__"),
     )
-    # Alone on the path: the finder of an editable install would add the core to these sources.
+    # The sources are alone on the path: an editable install's finder would add the core.
     code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; import diffcloth_torch"
     command = [sys.executable, "-S", "-c", code]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)

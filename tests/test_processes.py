@@ -62,7 +62,7 @@ def test_an_error_of_a_piece_is_raised_with_its_traceback(pool):
     with pytest.raises(ZeroDivisionError) as caught:
         list(pool.map(work, [("", 0, None), ("raise", ZeroDivisionError("at 3"), None)]))
     assert "in work" in str(caught.value.__cause__)
-    assert list(pool.map(work, [("", 1, None)])) == [1]  # the pool goes on
+    assert list(pool.map(work, [("", 1, None)])) == [1]  # the pool still works
 
 
 def test_a_piece_of_a_process_that_dies_is_repeated(pool, tmp_path):
@@ -88,7 +88,7 @@ def test_a_piece_whose_processes_die_ends_in_a_sentence(pool, tmp_path, kind, me
 
 @pytest.mark.slow
 def test_a_process_that_stops_is_replaced_at_the_deadline(tmp_path):
-    pool = Pool("pool", 1, 15.0)  # on a loaded machine, to import this file takes seconds
+    pool = Pool("pool", 1, 15.0)  # on a loaded machine, importing this file needs seconds
     try:
         assert list(pool.map(work, [("stop once", 5, tmp_path)])) == [5]
     finally:
@@ -106,7 +106,7 @@ def test_a_process_that_stops_again_and_again_ends_in_a_sentence(tmp_path):
 
 @pytest.mark.slow
 def test_progress_begins_the_deadline_anew(tmp_path):
-    pool = Pool("pool", 1, 15.0)  # the piece takes 18 s
+    pool = Pool("pool", 1, 15.0)  # the piece needs 18 s
     try:
         assert list(pool.map(work, [("progress", 7, tmp_path)])) == [7]
     finally:
@@ -142,8 +142,8 @@ def test_close_ends_the_processes(tmp_path):
     assert not any(map(lives, pids))
 
 
-# Two workers, one of which has a worker of its own and one of which is stopped; a forked process
-# holds all connections open.
+# Two workers: one has its own worker, the other is stopped; a forked process keeps all connections
+# open.
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path
@@ -183,7 +183,7 @@ if __name__ == "__main__":
 
 
 def started(tmp_path, names):
-    """A main process of the script, and the numbers of its workers."""
+    """A main process of the script, and the process ids of its workers."""
     script = tmp_path / "main.py"
     script.write_text(textwrap.dedent(SCRIPT))
     with (tmp_path / "output").open("w") as output:
@@ -207,7 +207,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path, number):
 
 
 def test_processes_end_while_they_start(tmp_path):
-    """The main process is killed as soon as it has begun to start them."""
+    """The main process is killed as soon as it has begun to start its processes."""
     main, _ = started(tmp_path, ["main"])
     await_that(lambda: len(children(main.pid)) == 2)
     pids = children(main.pid)
@@ -219,7 +219,7 @@ def test_processes_end_while_they_start(tmp_path):
 def test_an_interrupt_ends_the_processes(tmp_path):
     main, pids = started(tmp_path, ["forked", "inner", "stopped"])
     try:
-        for pid in (main.pid, pids["inner"]):  # a terminal sends it to all
+        for pid in (main.pid, pids["inner"]):  # a terminal sends the interrupt to all
             os.kill(pid, signal.SIGINT)
         assert main.wait(PATIENCE) == 0
         assert (tmp_path / "output").read_text() == "interrupted\n"

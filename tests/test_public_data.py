@@ -1,4 +1,4 @@
-"""Data beside the clone: the reason of a skip names them, and CI does not skip."""
+"""Data beside the clone: the reason of a skip names the data, and CI does not skip."""
 
 import public_data
 import pytest

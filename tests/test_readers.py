@@ -1,4 +1,4 @@
-"""Files of any content: each reader gives what it stands for, or one `InvalidInput`."""
+"""Files of any content: each reader returns the file's data or raises one `InvalidInput`."""
 
 import os
 import signal
@@ -70,7 +70,7 @@ OF_BODIES = (".dae", ".glb")
 
 @contextmanager
 def seconds(count):
-    """Fail where something does not end."""
+    """Fail if the block does not end within `count` seconds."""
 
     def too_long(*_):
         raise TimeoutError
@@ -193,7 +193,7 @@ def test_the_files_that_are_changed_are_good_ones(tmp_path, suffix, content):
         np.testing.assert_array_equal(result[1], [[0, 1, 2]])
 
 
-# --- What is no file -----------------------------------------------------------------------------
+# --- Paths that are no files ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", SEEDS)

@@ -1,4 +1,4 @@
-"""What public objects say of themselves: a few lines, and what is there."""
+"""Reprs of public objects: a few lines with the present fields."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_a_state_says_time_shapes_and_how_the_step_went(simulator, state):
     assert "body_poses=float64[2, 7]" in text
     assert "joint_positions=[" in text
     assert f"report=Report(converged=True, iterations={state.report.iterations}, ...))" in text
-    assert "soft_pin_targets" not in text  # there are none
+    assert "soft_pin_targets" not in text  # the scene has no soft pins
     assert "report=None" in lines(simulator.initial_state())
 
 
@@ -77,7 +77,7 @@ def test_a_control_says_what_is_set(simulator):
 
 
 @pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
-def test_what_is_no_tensor_or_not_on_the_cpu_is_said_too(state):
+def test_reprs_show_fields_that_are_no_cpu_tensors(state):
     """Nothing checks the fields of a record before a step does."""
     nested = torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)])
     for value, text in (
@@ -117,7 +117,7 @@ def test_a_report_of_a_batch_says_what_its_numbers_range_over(simulator):
     assert lines(mixed).endswith("counts={})")
 
 
-def test_what_a_scene_is_made_of(simulator):
+def test_a_scene_shows_its_parts(simulator):
     cloth, hand = simulator.scene.cloths[0], simulator.scene.robots[0]
     ball, floor = simulator.scene.bodies
     assert repr(cloth) == "Cloth('sheet', 576 vertices, 1058 faces)"

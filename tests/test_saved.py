@@ -1,4 +1,4 @@
-"""Objects in files load, those of 0.1 too; names are imported when they are first used."""
+"""Objects in files load, including files of 0.1; names are imported at their first use."""
 
 import importlib
 import pickle
@@ -14,7 +14,7 @@ from processes import run_python
 import diffcloth_torch as dc
 from diffcloth_torch import saved, saved_0_1
 
-SAVED = Path(__file__).parent / "data" / "saved_0_1"  # by save_records.py there
+SAVED = Path(__file__).parent / "data" / "saved_0_1"  # written by data/save_records.py
 KINDS = "['ContactPoints', 'Control', 'Parameters', 'State']\n"
 SHOW = "print(sorted({type(value).__name__ for value in saved.values()}))"
 
@@ -68,13 +68,13 @@ def test_the_table_has_the_module_of_each_saved_class():
 
 
 def globals_of(data: bytes) -> set[str]:
-    """Names that a pickle of protocol 2 refers to, without those of torch."""
+    """Names that a pickle of protocol 2 refers to, except torch's."""
     names = (arg for op, arg, _ in pickletools.genops(data) if op.name == "GLOBAL")
     return {name for name in names if not name.startswith(("torch", "collections", "_codecs"))}
 
 
 def test_files_name_no_module_of_a_class():
-    """All that a simulator and its records hold: a class without `saved` would add its module."""
+    """A simulator and its records: a class without `saved` would add its module."""
     whole = load_pickle()
     whole["trajectory"] = list(dc.Trajectory([whole["state"]]))
     ours = {f"diffcloth_torch.saved restore{kind}" for kind in ("", "_array", "_slice")}
@@ -97,7 +97,7 @@ def test_a_class_outside_of_the_table_is_refused():
 
 
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-def test_each_protocol_loads(protocol):
+def test_every_protocol_loads(protocol):
     whole = load_pickle()
     again = pickle.loads(pickle.dumps(whole, protocol=protocol))
     assert {name: type(value) for name, value in again.items()} == {
@@ -108,7 +108,7 @@ def test_each_protocol_loads(protocol):
 _IMPORT = r"from diffcloth_torch\.([\w.]+) import ([^()]+?|\([^)]*\))\n"
 
 
-def test_names_are_found_where_they_are_said_to_be():
+def test_names_are_found_in_the_listed_modules():
     """The table of homes, the imports that type checkers see and the public names agree."""
     source = Path(dc.__file__).read_text()
     block = source[source.index("if TYPE_CHECKING") : source.index("__all__ = ")]
@@ -136,7 +136,7 @@ def test_a_name_that_never_was_is_refused():
 
 
 def same(a, b):
-    """Whether two records hold the same numbers."""
+    """Return whether two records have the same numbers."""
     if isinstance(a, torch.Tensor):
         return torch.equal(a.nan_to_num(), b.nan_to_num())
     if isinstance(a, tuple | list):

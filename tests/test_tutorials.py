@@ -22,7 +22,7 @@ def names(text):
     return toctree.split()
 
 
-def test_all_of_them_are_listed():
+def test_all_tutorials_are_listed():
     assert len(TUTORIALS) == 7
     index = (DOCS / "tutorials/index.md").read_text()
     assert sorted(names(index)) == [page.stem for page in TUTORIALS]
@@ -39,7 +39,7 @@ def test_every_program_has_a_page():
 
 @pytest.mark.parametrize("page", [*TUTORIALS, *EXAMPLES], ids=lambda page: page.stem)
 def test_a_page_is_a_notebook(page):
-    """Of Python 3, with cells that compile, and text around them."""
+    """A page is for Python 3, and has cells that compile and text around the cells."""
     notebook = jupytext.read(page)
     assert notebook.metadata.kernelspec.name == "python3"
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]

@@ -85,7 +85,7 @@ def test_derivatives_by_positions_are_those_of_torch(name):
 
 @pytest.mark.parametrize("name", ONE_SIDED)
 def test_derivatives_by_inputs_are_those_of_torch(name):
-    """Of z . grad P by each input; also by coefficients that are zero."""
+    """Derivatives of z . grad P by each input, including coefficients that are zero."""
     values = ONE_SIDED[name]
     given = {n: t.requires_grad_() for n, t in tensors(values).items()}
     x = torch.tensor(X1, requires_grad=True)
@@ -126,7 +126,7 @@ def test_faces_that_move_with_the_wind_feel_nothing():
 
 @pytest.mark.parametrize("direction", ["across", "along"])
 def test_flow_in_one_direction_alone_has_derivatives(direction):
-    """Where one of the two parts of the velocity vanishes, nothing is divided by it."""
+    """If one of the two parts of the velocity vanishes, no derivative divides by this part."""
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0], [3, 3, 0]], float)
     wind = np.array([0.0, 0.0, 2.0] if direction == "across" else [2.0, 0.0, 0.0])
     drag = kernel(VALUES | {"start": flat, "wind": wind})

@@ -189,7 +189,7 @@ def test_other_endings_are_refused(states, tmp_path, name):
 
 
 @pytest.mark.parametrize("ending", [".pvd", ".glb", ".usd"])
-def test_what_a_format_cannot_hold_is_refused(states, batch, tmp_path, ending):
+def test_states_that_a_format_cannot_hold_are_refused(states, batch, tmp_path, ending):
     file = tmp_path / f"t{ending}"
     file.write_text("kept")
     with pytest.raises(dc.InvalidInput, match=r"one environment .* got a batch of 2"):

@@ -1,4 +1,4 @@
-"""Undocumented functions of torch against the public behavior that they stand for."""
+"""Undocumented functions of torch against the public behavior that they represent."""
 
 import subprocess
 import sys
@@ -166,7 +166,7 @@ def test_a_class_is_collated():
 
 @pytest.mark.slow
 def test_lines_that_are_not_compiled():
-    """Functions that are called from there still are."""
+    """Functions called from an uncompiled function are still compiled."""
     import torch._dynamo
 
     sizes = []

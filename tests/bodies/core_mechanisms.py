@@ -1,4 +1,4 @@
-"""Steps of trees of links in the core, called without the torch around it."""
+"""Steps of trees of links in the core, called without torch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def transform(position, angles=(0, 0, 0)):
 
 
 def one_body(*, free=True):
-    """One link whose root is free, or prescribed."""
+    """One link with a free or a prescribed root."""
     return trees(free, [FIXED], [np.eye(4)], [[0, 0, 0]], [-1], [1], [0], prescribed=[])
 
 
@@ -126,7 +126,7 @@ class CoreScene:
         }
 
     def inputs(self, after=None, **changes):
-        """Inputs of a step that goes on from the outputs of another."""
+        """Inputs of a step that continues from the outputs `after` of an earlier step."""
         arrays = dict(self.defaults)
         if after is not None:
             arrays["positions"], arrays["velocities"] = after["positions"], after["velocities"]

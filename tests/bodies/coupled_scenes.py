@@ -17,10 +17,10 @@ GRAVITY = np.array([0.4, -0.3, -9.81])
 WARM_UP = 3  # steps before a scene is in contact
 WEIGHT = 0.46 * 9.81  # of the gripper [N]
 
-# Of the gripper: its fingers point along -x and close along z.
+# Orientation of the gripper: fingers point along -x and close along z.
 _FACING = [0.5, -0.5, -0.5, 0.5]
 
-# What the fingers would exceed in each scene [m/s].
+# Velocity limit of the fingers, which their drives would exceed, by coupling and base [m/s].
 _FASTEST = {
     "monolithic": {"fixed": 0.012, "floating": 0.004, "kinematic": 0.012},
     "rigid_to_cloth": {"fixed": 0.012, "floating": 0.004, "kinematic": 0.02},
@@ -73,9 +73,9 @@ def simulator(coupling, base, integrator="implicit_euler", **options):
 
 
 def parameters(sim):
-    """Those of the scene; fingers are as much heavier as the box is.
+    """Parameters of the scene; the fingers are heavier by the same factor as the box.
 
-    They have friction, drives at the edge of their limits, and are as fast as they may be.
+    The fingers have friction, drives near their effort limits and speeds near their limits.
     """
     given = sim.default_parameters()
     heavier = _HEAVIER[sim.coupling]
@@ -110,9 +110,9 @@ def control(sim):
 
 
 def controls(sim, first, steps, start=0):
-    """`first` for each step; what is prescribed moves on, so that it never just stands still.
+    """`first` for each step; prescribed joints and bases keep moving.
 
-    A step in which nothing prescribed moves may find another minimum than one in which it does.
+    A step without prescribed motion may find another minimum than a step with such motion.
     """
     if sim.scene.robots[0].mechanism.base != "kinematic":
         return [first] * steps

@@ -28,9 +28,9 @@ FIELDS = (
 
 
 def roll(sim, state, steps, control=None, *, ignored=(), ignored_between=()):
-    """Step and judge the whole way, up to a step that is refused; all states, and whether it was.
+    """Step, judge each path, and stop at a refused step; all states, and True if one was refused.
 
-    Pairs `ignored_between` may meet between two states. A refusal leaves the given state alone.
+    Pairs `ignored_between` may meet between two states. A refusal leaves the given state unchanged.
     """
     judge = judge_of(sim, ignored)
     judge_between = judge_of(sim, [*ignored, *ignored_between])
@@ -77,7 +77,7 @@ def tumbling_boxes(speed, dt=DT):
     return sim, sim.initial_state().replace(body_velocities=velocities)
 
 
-# What hits the floor so fast is spun beyond what a step of DT resolves.
+# Impacts at these speeds cause spins that a step of DT does not resolve; hence shorter steps.
 @pytest.mark.quick("1.0-*", "10.0-*")
 @pytest.mark.parametrize(("speed", "dt"), [(1.0, DT), (10.0, DT / 5), (30.0, DT / 20)])
 def test_tumbling_boxes_never_meet(speed, dt):
@@ -112,9 +112,9 @@ def test_a_box_thrown_at_a_curtain_never_passes_through(coupling, pins, mass, sp
     velocity = torch.tensor([[speed, 0.1, 0.0, 3.0, -5.0, 2.0]], dtype=F64)
     states, refused = roll(sim, sim.initial_state().replace(body_velocities=velocity), 8)
     if coupling == "monolithic" and mass == 0.002:
-        # At 100 m/s the cloth may spin it beyond what a step takes.
+        # At 100 m/s the cloth may spin the box by more than a step allows.
         assert not refused or speed == 100.0
-        # The cloth is 15 times as heavy: it stops the box, if that has come there.
+        # The cloth is 15 times as heavy and stops the box if the box has reached the cloth.
         came = states[-1].body_poses[0, 0] > states[0].body_poses[0, 0]
         assert came or refused
         assert not came or states[-1].body_velocities[0, 0] < 0.5 * speed
@@ -130,7 +130,7 @@ def test_a_box_thrown_at_a_curtain_never_passes_through(coupling, pins, mass, sp
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_closing_gripper_never_passes_through(coupling, base, effort):
-    """On a sheet with a soft ball in front of it: cloth, body and links all touch."""
+    """The gripper closes on a sheet with a soft ball in front: cloth, body and links all touch."""
     sheet = dc.Cloth(
         *hanging_sheet(),
         material=dc.Material(stretch=200.0, density=0.2),
@@ -152,8 +152,8 @@ def test_a_closing_gripper_never_passes_through(coupling, base, effort):
     fingers = ("hand/left_finger", "hand/right_finger")
     pairs = {"ignored": [("hand/palm", finger) for finger in fingers]}
     if coupling == "rigid_to_cloth":
-        # While the cloth is solved, bodies go straight to where their own solve took them by
-        # another way, on which they did not meet.
+        # During the cloth solve, bodies move along straight lines to the poses of their own solve.
+        # Their own solve followed another path, on which these pairs did not meet.
         pairs["ignored_between"] = list(itertools.combinations(("ball", *fingers), 2))
     states, refused = roll(sim, sim.initial_state(), 15, control, **pairs)
     if coupling == "monolithic":
@@ -188,8 +188,8 @@ def test_a_driven_arm_sweeps_boxes_aside(tmp_path):
         DT,
         contact=dc.ContactOptions(barrier_distance=2e-3),
     )
-    # Steps that are short against the boxes push them; a long one may leave them where they were,
-    # as they can give way and come back.
+    # A short rotation per step pushes the boxes. A long rotation may leave the boxes in place,
+    # because they can be displaced and return within the step.
     states, refused = [sim.initial_state()], False
     for degrees in (50.0, 54.0, 58.0, 62.0, 66.0, 70.0, 130.0, 250.0):
         control = sim.control(joint_positions=[np.radians(degrees)])

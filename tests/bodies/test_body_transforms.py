@@ -1,4 +1,4 @@
-"""What only looks at a state has the same derivatives under `torch.func`."""
+"""Observables of a state have the same derivatives under `torch.func`."""
 
 import pytest
 import torch
@@ -46,7 +46,7 @@ def test_different_numbers_in_one_call_are_refused(sim):
 
 
 def test_the_compiler_leaves_a_step_alone(sim):
-    """It sees the few lines around it."""
+    """The compiler traces only the lines around the step."""
 
     def run(state):
         return sim.step(state).joint_positions * 2

@@ -43,12 +43,12 @@ def body_in_contact():
 
 
 def with_bounds(arrays, scene, name):
-    """The last step again, with a term of the hinge that is active in one of its parts."""
+    """Inputs of the last step with a joint term of the hinge, of which one part is active."""
     n = arrays["coordinates"].shape[1]
     hinge, stiffness = n - 2, 40.0
     slip = float(scene.forward(arrays)["coordinates"][0, hinge] - arrays["coordinates"][0, hinge])
     metric = arrays["coordinate_metric"].reshape(1, n, n).copy()
-    metric[0, hinge, hinge] += stiffness  # the drive's
+    metric[0, hinge, hinge] += stiffness  # of the drive
     speed = abs(slip) / DT
     terms = np.tile([0.0, 0.0, 0.0, 1e30, 1e30, 0.0, 1.0], (1, n, 1))
     terms[0, hinge] = {
@@ -62,9 +62,9 @@ def with_bounds(arrays, scene, name):
 
 
 def chain_in_contact(*, free, light=False):
-    """A chain that comes down on the cloth, its hinge beyond its limit, its slide prescribed.
+    """A chain that lands on the cloth; its hinge is beyond its limit, its slide is prescribed.
 
-    One that is `light` has no limit: what its joints do to their own leverage then counts.
+    A `light` chain has no limit: the effect of its joints on their own lever arms then counts.
     """
     rng = np.random.default_rng(1)
     trees = chain(free=free)
@@ -105,7 +105,7 @@ def chain_in_contact(*, free, light=False):
         result = scene.forward(arrays)
         touching += int(result["contact_count"][0] > 0)
         if touching == 3:
-            assert light or result["coordinates"][0][-2] > 0.2  # beyond it, within its zone
+            assert light or result["coordinates"][0][-2] > 0.2  # beyond the limit, within its zone
             return scene, arrays
         speed = 0.9 * (result["coordinates"][0] - q) / DT
         speed[-2] += 0.5
@@ -130,7 +130,7 @@ def case(request):
     if bound:
         arrays = with_bounds(arrays, scene, bound)
     rng = np.random.default_rng(2)
-    # Friction sees everything come from elsewhere, as in a staggered coupling.
+    # Friction measures motion from other origins than the start, as in a staggered coupling.
     start = scene.core.path({k: v[:1] for k, v in arrays.items()})[0]
     away = 0.3 * DT * rng.standard_normal(start.shape)
     arrays = {**arrays, "friction_origins": (start - away)[None]}
@@ -178,7 +178,7 @@ def test_gradients_agree_with_differences(case, name):
     if name in ("friction", "thickness"):
         direction = abs(direction)
     if name == "joint_terms":
-        direction *= arrays[name] < 1e20  # not where a limit is none
+        direction *= arrays[name] < 1e20  # larger values denote a missing limit
         direction[..., [3, 4, 6]] *= 10.0
         assert ((gradients[name] * direction) != 0.0).sum() >= 2
     if name == "coordinate_metric":
@@ -196,7 +196,7 @@ def test_gradients_agree_with_differences(case, name):
 
 
 def test_the_gradient_by_a_metric_is_symmetric(case):
-    """As the metric is: so no half of it has a gradient of its own."""
+    """The metric is symmetric too: neither of its triangles has a gradient of its own."""
     _, arrays, _, gradients = case
     n = arrays["coordinates"].shape[1]
     gradient = gradients["coordinate_metric"].reshape(n, n)
@@ -205,7 +205,7 @@ def test_the_gradient_by_a_metric_is_symmetric(case):
 
 
 def test_a_body_prescribed_where_a_free_one_went_leaves_the_cloth_where_it_was():
-    # Without friction: its lag would be at where the body was in the iteration before.
+    # Without friction, whose lagged quantities would use the body's previous iterate.
     scene, arrays = body_in_contact()
     arrays["friction"] = 0 * arrays["friction"]
     result = scene.forward(arrays)
@@ -232,7 +232,7 @@ def world_pose(frame, q):
 
 @pytest.mark.parametrize("name", ["positions", "coordinates", "body_poses", "coordinate_targets"])
 def test_tangents_are_the_transpose_of_gradients(case, name):
-    """Also where friction counts motion from points that are inputs of their own."""
+    """This holds also if friction measures motion from separately given origins."""
     scene, arrays, cotangents, gradients = case
     direction = np.random.default_rng(4).standard_normal(arrays[name].shape)
     result = scene.forward(arrays, tape=True)
@@ -244,8 +244,8 @@ def test_tangents_are_the_transpose_of_gradients(case, name):
 
 
 @pytest.mark.parametrize("what", ["body", "joint", "mimic", "both"])
-def test_what_is_prescribed_turns_along_its_arc(what):
-    """By a third of a turn in a step, far from the cloth: no straight way through the body."""
+def test_prescribed_bodies_and_joints_turn_along_their_arcs(what):
+    """A third of a turn per step, far from the cloth: points do not follow chords of the arc."""
     angle = 2.0
     if what == "body":
         scene = CoreScene(one_body(free=False), BOXES[:1])

@@ -1,4 +1,4 @@
-"""The staggered couplings: what each does in which order, where they warn, their gradients."""
+"""The staggered couplings: order of the solves, warnings and gradients."""
 
 import pickle
 import re
@@ -44,7 +44,7 @@ def trampoline(coupling, *, mass=2.0, height=0.057, scheme="coupled", dt=DT, vel
 @STAGGERED
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_momentum_goes_from_the_body_to_the_sheet(coupling, scheme):
-    """What the body's momentum lacks against its fall is the impulse of `body_forces`."""
+    """The body's momentum change minus the impulse of gravity is the impulse of `body_forces`."""
     sim, state = trampoline(coupling, scheme=scheme)
     touched = False
     for _ in range(12):
@@ -70,7 +70,7 @@ def test_rigid_to_cloth_moves_bodies_with_their_velocities():
 
 
 def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
-    """The sheet sees the box where it was: a box held there leaves the same sheet."""
+    """The sheet collides with the box at its start pose: a box held there yields the same sheet."""
     sim, state = trampoline("cloth_to_rigid")
     state = sim.rollout(state, steps=8)[-1]
     (box,) = sim.scene.bodies
@@ -81,7 +81,7 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
         contact=sim.contact,
         solver=sim.solver,
     )
-    # Friction alone sees the box move on.
+    # Friction is the only term that depends on the box's motion in the step.
     same = sim.default_parameters().replace(friction=torch.zeros(2, 2, dtype=F64))
     barrier = alone.default_parameters().replace(
         barrier_stiffness=same.barrier_stiffness, friction=same.friction
@@ -123,7 +123,7 @@ def resting(coupling, *, with_cloth, with_bodies=True):
 
 @STAGGERED
 def test_bodies_touch_each_other_as_if_there_were_no_cloth(coupling):
-    """Frictions and thicknesses are their own, and so are the forces between them."""
+    """Bodies keep their own friction and thickness, and the forces between bodies are the same."""
     sim, state = resting(coupling, with_cloth=True)
     alone, other = resting("monolithic", with_cloth=False)
     for _ in range(4):
@@ -178,8 +178,8 @@ def test_a_light_body_warns_once(coupling):
 
 @STAGGERED
 @pytest.mark.parametrize("source", ["wind", "forces", "body_wrenches", "body_poses"])
-def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, source):
-    """A sheet and what lies under it are pressed together, without a warning."""
+def test_externally_driven_motion_is_no_gain_of_the_coupling(coupling, source):
+    """A sheet and the bodies under it are pressed together, without a warning."""
     airy = dc.Material(stretch=200.0, density=0.2, normal_drag=1.0)
     sheet = dc.Cloth.grid(5, 5, 0.3, material=airy, pose=[0, 0, 0.055, 1, 0, 0, 0])
     bodies = [
@@ -208,7 +208,7 @@ def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, sou
 
 
 @STAGGERED
-def test_what_a_floor_gives_back_is_no_gain_of_the_coupling(coupling):
+def test_the_rebound_from_a_floor_is_no_gain_of_the_coupling(coupling):
     """A box bounces on a floor, with a sheet on it."""
     sheet = dc.Cloth.grid(5, 5, 0.3, pose=[0, 0, 0.1085, 1, 0, 0, 0])
     bodies = [
@@ -256,15 +256,16 @@ def test_a_light_link_is_warned_of_by_its_name(coupling, tmp_path):
     other = dc.Robot.load(GRIPPER, actuation="torque", pose=[6, 0, 0, 1, 0, 0, 0], name="other")
     scene = dc.Scene(sim.scene.cloths, [away], [other, robot])
     sim = dc.Simulator(scene, DT, coupling=coupling, contact=sim.contact)
-    # Of the sheet, 13 times as heavy as the plate, counts what is in the plate's box.
+    # Only the part of the sheet within the plate's bounding box counts as added mass; the whole
+    # sheet is 13 times as heavy as the plate.
     words = r"the added-mass number of 'arm/plate' is about \d(\.\d)?, above 0\.5"
     with pytest.warns(dc.AddedMassWarning, match=words):
         sim.rollout(sim.initial_state(), steps=3)
 
 
 @pytest.mark.parametrize(("way", "speed"), [(-0.004, 0.0), (0.006, 3.0)])
-def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
-    """Only what forces move stands still meanwhile; there is nothing to wait for here."""
+def test_cloth_to_rigid_moves_prescribed_bodies_with_the_cloth(way, speed):
+    """Only bodies that forces move are frozen in the cloth solve; a kinematic body is not."""
     sheet = trampoline("monolithic")[0].scene.cloths
     mover = dc.RigidBody.box(0.1, motion="kinematic", pose=[0.013, 0.021, 0.052, 1, 0, 0, 0])
     far = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0])
@@ -279,7 +280,7 @@ def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
         poses = state.body_poses.clone()
         poses[0, 2] += way
         ends.append(sim.step(state, dc.Control(body_poses=poses)))
-    # Through where the sheet was, or the sheet through where the body was.
+    # The body moves through the sheet's start plane, or the sheet through the body's.
     level = 0.002 if way > 0 else 0.0
     assert (float(ends[0].positions[12, 2]) - level) * way > 0
     assert ends[0].body_forces[:8, 2].sum() > 0.2
@@ -289,7 +290,7 @@ def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
 
 
 def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
-    """The frozen box does not touch the sheet, which cannot make way when the box then moves."""
+    """The frozen box does not touch the sheet, and the solved sheet cannot avoid the moving box."""
     sim, state = trampoline("cloth_to_rigid", height=0.08, velocity=-30.0)
     with pytest.raises(dc.InfeasibleMotion, match=r"cannot go on past .* in contact: cloth .*body"):
         sim.step(state)
@@ -302,15 +303,16 @@ def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
 
 
 def carried(coupling, dt, *, sheet=0.0, box=(0.0, 0.0), duration=0.16):
-    """A sheet on a heavy box without weight that glides and turns; the state at the end.
+    """Final state of a sheet on a heavy box that glides and rotates without gravity.
 
-    Speeds of the sheet and of the box along x [m/s], and that of the box's turn [rad/s].
+    `sheet` is the sheet's speed along x [m/s]; `box` the box's speed along x [m/s] and its
+    angular speed [rad/s].
     """
     cloth = dc.Cloth.grid(
         5, 5, 0.18, material=dc.Material(stretch=200.0, density=0.2, friction=0.4)
     )
     vertices = cloth.vertices - cloth.vertices.mean(axis=0) + [0.003, 0.003, 0.0015]
-    # Not flat: the exact plane of a sheet that is dragged is a saddle.
+    # The exact plane of a dragged sheet is a saddle point of the energy; noise avoids it.
     vertices[:, 2] += 1e-4 * np.random.default_rng(0).standard_normal(len(vertices))
     cloth = dc.Cloth(vertices, cloth.faces, material=cloth.material)
     body = dc.RigidBody.box(
@@ -333,7 +335,7 @@ def carried(coupling, dt, *, sheet=0.0, box=(0.0, 0.0), duration=0.16):
     "motion", [{"sheet": 0.4, "box": (0.4, 0.0)}, {"box": (0.3, 0.0)}, {"box": (0.0, 1.5)}]
 )
 def test_friction_against_a_body_that_moves_is_that_of_one_solve(coupling, motion):
-    """A sheet that glides along goes on; one at rest is dragged, and turned."""
+    """A sheet that moves with the box keeps its motion; a sheet at rest is dragged and rotated."""
     errors = []
     for dt in (0.01, 0.0025):
         together, apart = (carried(name, dt, **motion) for name in ("monolithic", coupling))
@@ -341,7 +343,8 @@ def test_friction_against_a_body_that_moves_is_that_of_one_solve(coupling, motio
             difference = getattr(together, name) - getattr(apart, name)
             assert difference[:, :2].abs().max() < 1e-4
         errors.append(difference[:, :2].abs().max())
-    # What is late by a step is wrong by less in shorter ones; a turn loses its digits to a bounce.
+    # The coupling lags by one step, so its error falls with the time step. With a rotating box a
+    # bounce dominates the error.
     if coupling == "cloth_to_rigid" and not motion["box"][1]:
         assert errors[1] < 0.5 * errors[0]
 
@@ -366,7 +369,7 @@ def test_the_warning_comes_before_much_energy_is_gained(coupling, mass, dt):
             energies.append(float(sim.energy(state) + sim.kinetic_energy(state)))
     assert caught[0].category is dc.AddedMassWarning
     assert re.search("'box' (gained|is about)", str(caught[0].message))
-    # Of what it has lost in its fall, and of its speed.
+    # Relative to the potential energy lost in the fall plus the initial kinetic energy.
     energies = np.array(energies)
     rise = (energies - np.minimum.accumulate(energies)).max()
     speed = 0.5 * mass * 0.2**2
@@ -385,7 +388,7 @@ def test_nothing_is_said_where_nothing_is_gained(mass, dt):
 
 
 def tumbling(seed, coupling, *, kinematic):
-    """Boxes that fly into each other over a sheet; the topmost comes down on its own way."""
+    """Boxes that collide over a sheet; if `kinematic`, the topmost moves down as prescribed."""
     r = np.random.default_rng(seed)
     sheet = dc.Cloth.grid(4, 4, 0.3, pins={"corners": [0, 3, 12, 15]})
     bodies, twists = [], []
@@ -404,7 +407,7 @@ def tumbling(seed, coupling, *, kinematic):
 @STAGGERED
 @pytest.mark.parametrize("kinematic", [False, True])
 def test_no_body_crosses_another_on_the_way(coupling, kinematic):
-    """Either the whole path is free, or the step says that there is none."""
+    """Either the whole path is free of intersections, or the step reports that none exists."""
     judged = refused = 0
     for seed in range(4):
         sim, state = tumbling(seed, coupling, kinematic=kinematic)
@@ -427,7 +430,7 @@ def test_no_body_crosses_another_on_the_way(coupling, kinematic):
 
 
 @STAGGERED
-def test_nothing_intersects_and_the_path_leads_there(coupling):
+def test_nothing_intersects_and_the_path_leads_to_the_end(coupling):
     sim, state = trampoline(coupling)
     for _ in range(20):
         path = sim.path(state)
@@ -473,7 +476,7 @@ def test_batches_and_pickles_have_the_same_bits(coupling):
 
 @STAGGERED
 def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_path):
-    """Without contact the order does not matter."""
+    """Without contact the order of the solves does not matter."""
     scene = make_scene(tmp_path)
     ends = []
     for name in ("monolithic", coupling):
@@ -490,8 +493,8 @@ def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_pat
 
 
 @STAGGERED
-def test_what_is_prescribed_passes_through_what_is_prescribed(coupling):
-    """A hand goes through a wall, beside a sheet and a box that fall."""
+def test_prescribed_surfaces_pass_through_each_other(coupling):
+    """A kinematic hand passes through a wall, beside a falling sheet and a falling box."""
     hand = dc.Robot.load(GRIPPER, base="kinematic", actuation="position", name="hand")
     sheet = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 2, 1, 0, 0, 0])
     box = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0])

@@ -34,7 +34,7 @@ def breathing(vertices, t):
 # --- Motion, mass, elasticity ---------------------------------------------------------------------
 
 
-def test_its_vertices_follow_the_control(tmp_path):
+def test_vertices_of_a_deforming_body_follow_the_control(tmp_path):
     simulator = dropped(ball())
     assert simulator.surfaces == ("sheet", "walker")
     rows = simulator.slices["walker"]
@@ -69,8 +69,8 @@ def test_environments_of_a_batch_move_apart():
         assert torch.equal(batch.positions[i], alone.positions)
 
 
-def test_it_has_no_mass_and_no_elasticity():
-    """A far one changes no bit of the motion of a sheet, however it deforms."""
+def test_a_deforming_body_has_no_mass_and_no_elasticity():
+    """A distant deforming body changes no bit of a sheet's motion, for any deformation."""
     sheet = dc.Cloth.grid((5, 5), 0.3, name="sheet", pins={"edge": range(5)})
     far = ball(pose=[3, 0, 0, 1, 0, 0, 0])
     simulator = dc.Simulator(dc.Scene([sheet], [far]), 0.01)
@@ -95,7 +95,7 @@ def test_it_has_no_mass_and_no_elasticity():
         assert all(torch.equal(energies[0][part], energies[1][part]) for part in energies[1])
 
 
-def test_it_may_cross_itself_and_what_is_prescribed():
+def test_a_deforming_body_may_cross_itself_and_prescribed_bodies():
     table = dc.RigidBody.box(0.2, pose=[0, 0, -0.25, 1, 0, 0, 0])
     hand = dc.RigidBody.box(0.05, motion="kinematic", pose=[0.05, 0, -0.05, 1, 0, 0, 0])
     other = dc.DeformingBody.grid((3, 3), 0.4, name="other")
@@ -127,8 +127,8 @@ def free(state, simulator, ipctk):
 
 
 @pytest.mark.parametrize("speed", [1.0, 10.0])
-def test_it_never_passes_through_cloth(speed):
-    """A punch of many edge lengths a step takes the sheet along."""
+def test_a_deforming_body_never_passes_through_cloth(speed):
+    """A punch that moves by many edge lengths per step carries the sheet along."""
     ipctk = pytest.importorskip("ipctk")
     simulator = dropped(ball(), counts=(7, 7), dt=0.02)
     state = simulator.initial_state()
@@ -157,7 +157,7 @@ def test_a_start_that_overlaps_is_refused():
         dropped(ball(), height=0.05)
 
 
-def test_cloth_rests_on_it():
+def test_cloth_rests_on_a_deforming_body():
     """The forces of contact bear the weight of the sheet, at rest."""
     simulator = dropped(ball(), counts=(5, 5))
     rest = simulator.equilibrium(simulator.initial_state())
@@ -173,7 +173,7 @@ def test_cloth_rests_on_it():
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_its_moving_surface_drags_cloth_along(friction):
+def test_a_moving_surface_drags_cloth_along(friction):
     """A belt of 1 m/s accelerates a sheet that lies on it by mu g."""
     belt = dc.DeformingBody.grid((9, 5), (1.2, 0.4), name="belt", friction=friction)
     sheet = dc.Cloth.grid(
@@ -195,7 +195,7 @@ def test_its_moving_surface_drags_cloth_along(friction):
     assert state.velocities[:25, 1].abs().max() < 0.02
 
 
-def test_a_dynamic_body_rests_on_it_and_is_dragged_along():
+def test_a_dynamic_body_rests_on_a_deforming_body_and_is_dragged_along():
     belt = dc.DeformingBody.grid((13, 5), (1.2, 0.4), friction=0.5, name="belt")
     box = dc.RigidBody.box(
         [0.1, 0.1, 0.05],
@@ -215,12 +215,12 @@ def test_a_dynamic_body_rests_on_it_and_is_dragged_along():
     for _ in range(20):
         moved = state.positions[rows] + torch.tensor([0.01, 0, 0])
         state = simulator.step(state, dc.Control(body_vertices={"belt": moved}))
-    # It rocks a little on its springs of contact.
+    # The body rocks slightly on the contact forces.
     assert state.body_velocities[0, 0].item() == pytest.approx(0.5 * G * 0.1, rel=0.03)
 
 
 def test_a_surface_that_widens_in_its_plane_drags_cloth_apart():
-    """Nothing of it moves at its center, and more the farther outwards: the sheet is stretched."""
+    """The belt's center rests and its speed grows outwards: the sheet is stretched."""
     belt = dc.DeformingBody.grid((9, 9), 0.5, name="belt", friction=1.0)
     soft = dc.Material(stretch=0.2, friction=1.0, bending=1e-4)
     sheet = dc.Cloth.grid((5, 5), 0.2, pose=[0, 0, 0.0125, 1, 0, 0, 0], material=soft)
@@ -241,7 +241,7 @@ def test_a_surface_that_widens_in_its_plane_drags_cloth_apart():
 
 
 @pytest.mark.parametrize("steps", [1, 4])
-def test_gradients_by_its_motion(steps):
+def test_gradients_by_the_motion_of_a_deforming_body(steps):
     """In contact with friction, by all vertices at all times, against differences of order four."""
     simulator = dropped(ball(subdivisions=1), counts=(5, 5), height=0.1045)
     state = simulator.equilibrium(simulator.initial_state())
@@ -273,7 +273,7 @@ def test_gradients_by_its_motion(steps):
 # --- Refusals -------------------------------------------------------------------------------------
 
 
-def test_scenes_that_cannot_have_it_are_refused():
+def test_scenes_without_support_for_deforming_bodies_are_refused():
     sheet = dc.Cloth.grid((3, 3), 0.2, pose=[0, 0, 1, 1, 0, 0, 0])
     with pytest.raises(
         TypeError, match=r"`bodies` must hold DeformingBody objects, not `cloths`\[1\]"
@@ -309,14 +309,14 @@ def test_other_motions_are_refused(given, message):
         simulator.step(simulator.initial_state(), dc.Control(body_vertices=given))
 
 
-def test_without_one_nothing_is_to_be_moved():
+def test_a_control_of_a_missing_deforming_body_is_refused():
     sheet = dc.Cloth.grid((3, 3), 0.2)
     simulator = dc.Simulator(dc.Scene([sheet]), 0.01)
     with pytest.raises(dc.InvalidInput, match="the scene has nothing of the kind"):
         simulator.control(body_vertices={"walker": np.zeros((3, 3))})
 
 
-def test_woven_and_hinged_cloths_meet_it():
+def test_woven_and_hinged_cloths_meet_a_deforming_body():
     for material, model in (
         (dc.fabrics.material("denim", friction=0.3), "patch"),
         (dc.Material(), "hinge"),
@@ -331,7 +331,7 @@ def test_woven_and_hinged_cloths_meet_it():
         simulator.step(state, None, named)
 
 
-def test_pictures_have_it(tmp_path):
+def test_pictures_show_a_deforming_body(tmp_path):
     simulator = dropped(ball())
     state = simulator.initial_state()
     assert list(state.meshes()) == ["sheet", "walker"]

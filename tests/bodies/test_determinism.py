@@ -20,7 +20,7 @@ FIELDS = (*MOVED, "soft_pin_targets", "body_forces", "joint_targets", "joint_eff
 
 @pytest.fixture
 def threads():
-    """A function that sets the number of threads; it is reset afterwards."""
+    """A function that sets the number of threads; the fixture restores the number afterwards."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -40,7 +40,7 @@ def same(a, b):
 
 
 def pull(sim, state, steps=2):
-    """States after some steps, and gradients of a loss on the last of them by the start."""
+    """States after `steps` steps, and the gradients of a loss on the last state by the start."""
     leaves = {name: getattr(state, name).clone().requires_grad_() for name in MOVED}
     masses = coupled_scenes.parameters(sim)
     controls = [coupled_scenes.control(sim)] * steps
@@ -81,7 +81,7 @@ def test_a_step_repeats_to_the_bit_whatever_went_before(coupling, base):
 
 @CASES
 def test_environments_that_are_reset_go_on_as_if_alone(coupling, base):
-    """`where` puts the start in the place of some, whose gradients then end there."""
+    """`where` replaces some environments by the start, which ends their gradients there."""
     sim, singles = starts(coupling, base)
     given = (coupled_scenes.control(sim), coupled_scenes.parameters(sim))
     batch = dc.stack(singles)

@@ -41,7 +41,7 @@ class Inverse:
     def __init__(self, path, joint_names):
         self.model = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
         self.data = self.model.createData()
-        # Pinocchio's joints behind the base, in their order, and ours that they follow.
+        # Pinocchio's joints behind the base in Pinocchio's order, and our matching joints.
         self.names = list(self.model.names)[2:]
         self.rows = [joint_names.index(FOLLOWS.get(name, name)) for name in self.names]
 
@@ -84,7 +84,7 @@ def arm(tmp_path):
 
 
 def far_away():
-    """A cloth, which a scene needs where no force moves a robot."""
+    """A cloth; a scene without force-driven joints requires one."""
     return dc.Cloth.grid(2, 2, 0.1, pose=[9, 9, 9, 1, 0, 0, 0], pins={"all": range(4)})
 
 
@@ -146,11 +146,11 @@ CASES = [
 
 @pytest.mark.parametrize(("base", "actuation"), CASES)
 def test_efforts_are_those_of_inverse_dynamics(arm, base, actuation):
-    """Of an arm that swings; the difference falls with the time step."""
+    """For a swinging arm, the difference falls with the time step."""
     options = {"base": base, "actuation": actuation, "start": [0.7, -0.5, 0.1]}
     coarse, fine = (error(arm, h, **options, amplitude=[0.9, -0.7, 0.2])[0] for h in (0.008, 0.004))
     finest, largest = error(arm, 0.002, **options, amplitude=[0.9, -0.7, 0.2])
-    # What falls and tumbles has small efforts, which are differences of large forces.
+    # A falling and tumbling arm has small efforts, which are differences of large forces.
     assert finest < (0.2 if base == "floating" else 0.02) * largest
     assert finest < 0.65 * fine
     assert fine < 0.65 * coarse
@@ -186,7 +186,7 @@ def test_efforts_of_a_panda(free):
 
 
 def test_a_held_pendulum_needs_its_weight(arm):
-    """Nothing moves, nothing is touched: torques of weights alone."""
+    """Without motion and contact the efforts are the torques of the weights."""
     robot = dc.Robot.load(arm, actuation="position", joint_positions=[0.4, 0.0, 0.0])
     sim = dc.Simulator(dc.Scene([far_away()], robots=[robot]), 0.013)
     state = sim.step(sim.initial_state())
@@ -210,8 +210,8 @@ def contact_wrenches(sim, state):
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
-def test_contact_is_held_too(coupling):
-    """A gripper on a moving base whose one finger is prescribed: it presses on cloth and box."""
+def test_efforts_balance_contact(coupling):
+    """A gripper on a moving base, one finger of which is prescribed, presses on cloth and box."""
     sim, state = coupled_scenes.in_contact(coupling, "kinematic")
     given = coupled_scenes.controls(sim, coupled_scenes.control(sim), 2, start=3)
     with torch.no_grad():
@@ -227,7 +227,7 @@ def test_contact_is_held_too(coupling):
     alone = inverse.efforts(states, coupled_scenes.DT, gravity)[0]
     expected = inverse.efforts(states, coupled_scenes.DT, gravity, wrenches)[0]
     assert abs(expected - alone) > 0.2
-    # Up to what the time step leaves of the rest, and of the way over which contact acts.
+    # Up to errors of the time step, in the other terms and in the motion over which contact acts.
     assert abs(float(end.joint_efforts[0]) - expected) < 0.02 * abs(expected - alone)
 
 
@@ -237,8 +237,8 @@ def test_contact_is_held_too(coupling):
 @pytest.mark.parametrize(
     "name", ["ur5_robot.urdf", "allegro_left_hand.urdf", "talos_left_arm.urdf"]
 )
-def test_a_public_robot_holds_what_lies_on_it(name):
-    """The sheet still falls, the robot holds still: its weight and contact, without motion."""
+def test_a_public_robot_holds_a_sheet(name):
+    """The sheet still falls and the robot is at rest: efforts from weight and contact only."""
     path = robot_file("example-robot-data", name)
     robot, _ = inside_its_limits(path, actuation="position")
     sim = carrying(robot)
@@ -250,7 +250,7 @@ def test_a_public_robot_holds_what_lies_on_it(name):
         inverse.efforts([state] * 3, sim.dt, sim.scene.gravity, wrenches)
         for wrenches in ([], contact_wrenches(sim, state))
     ]
-    # The share of a sheet of a gram, which has just landed, in the efforts that hold kilograms.
+    # Contribution of a sheet of one gram, just landed, to efforts that carry kilograms.
     share = abs(efforts[1] - efforts[0]).max()
     assert share > 1e-6
     np.testing.assert_allclose(state.joint_efforts, efforts[1], rtol=0, atol=1e-5 * share)

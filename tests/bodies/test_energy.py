@@ -1,4 +1,4 @@
-"""The monolithic coupling creates no energy for any masses; what is free keeps what it has."""
+"""The monolithic coupling creates no energy for any masses; free bodies keep their energy."""
 
 import warnings
 
@@ -19,7 +19,7 @@ def rolled(sim, state, steps, control=None):
 
 
 def energy(sim, state):
-    """Of motion, of gravity, and of everything that cloths and contact store [J]."""
+    """Kinetic and gravitational energy, and the energy stored by cloths and contact [J]."""
     given = sim.default_parameters()
     parts = [part for name, part in sim.energy(state, parts=True).items() if name != "gravity"]
     masses = cloth_masses(sim)[:, None]
@@ -72,7 +72,7 @@ def rigid_energy(frame, velocity, mass, center, inertia, gravity):
 @pytest.mark.parametrize("pinned", [False, True], ids=["free", "pinned"])
 @pytest.mark.parametrize("ratio", [1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3])
 def test_a_box_that_hits_a_cloth_creates_no_energy(ratio, pinned, friction):
-    """For every ratio of their masses, in every step."""
+    """This holds for every ratio of the masses, in every step."""
     vertices, faces = scenes.grid(6, 6, edge=0.05, seed=3)
     vertices -= vertices.mean(axis=0)
     rim = np.flatnonzero(np.abs(vertices[:, :2]).max(axis=1) > 0.11)
@@ -116,9 +116,9 @@ def test_boxes_that_fall_on_each_other_create_no_energy(ratio):
 
 
 def test_a_light_cube_is_pushed_not_shot():
-    """A cloth at speed V hits a cube of 4 g, with an added mass of some 30 times its own.
+    """A cloth at speed V hits a cube of 4 g; the added mass is about 30 times the cube's mass.
 
-    An elastic shock with something much heavier would leave it with 2 V.
+    An elastic shock with a much heavier object would leave the cube with 2 V.
     """
     speed = 1.0
     vertices, faces = scenes.grid(5, 5, edge=0.05, seed=3)
@@ -141,7 +141,7 @@ def test_a_light_cube_is_pushed_not_shot():
         assert 0.5 * speed < fastest("monolithic") < 2 * speed
     for coupling in ("rigid_to_cloth", "cloth_to_rigid"):
         with pytest.warns(dc.AddedMassWarning, match="monolithic"):
-            assert fastest(coupling) > 4 * speed  # why there is a monolithic one
+            assert fastest(coupling) > 4 * speed  # the reason for the monolithic coupling
 
 
 def gripped(coupling, steps):
@@ -155,7 +155,7 @@ def gripped(coupling, steps):
         material=dc.Material(stretch=300.0, density=0.2, friction=0.4),
         pins={"rim": rim},
     )
-    closed = 0.04  # where a finger would touch the sheet
+    closed = 0.04  # position at which a finger would touch the sheet
     hand = dc.Robot.load(
         dc.robots.GRIPPER, actuation="torque", joint_positions=closed - 4.5e-3, name="hand"
     )
@@ -186,7 +186,7 @@ def test_a_staggered_gripper_is_thrown_open():
 
 @pytest.mark.parametrize("driven", [False, True])
 def test_the_reaction_of_a_stop_takes_all_of_the_momentum(driven):
-    """dr/dv_n = -m/h, and minus what drives: the stop is inelastic within a step."""
+    """dr/dv_n = -m/h, less the driving force: the stop is inelastic within a step."""
     mass = 0.3
     box = dc.RigidBody.box(
         0.1, motion="dynamic", mass=mass, pose=[0, 0, 0.0515, 1, 0, 0, 0], name="box"
@@ -247,7 +247,7 @@ def test_a_tumbling_box_keeps_spin_and_energy(rate, seconds):
     assert np.abs(energies / energies[0] - 1).max() < 1e-3
     axes = torch.stack([matrices(s.body_poses)[0, :3, 1] for s in states])
     if seconds == 10.0:
-        assert (axes @ turn[:, 1]).min() < 0  # it has flipped over
+        assert (axes @ turn[:, 1]).min() < 0  # the box has flipped over
 
 
 PENDULUM = """<robot name="pendulum"><link name="base"/>
@@ -269,7 +269,7 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
     [(10.0, 1.0), *(pytest.param(rate, 10.0, marks=SLOW) for rate in (3.0, 10.0, 30.0))],
 )
 def test_a_passive_chain_creates_no_energy(rate, seconds, gravity, tmp_path):
-    """Within a hundredth of what it has above hanging at rest."""
+    """Within a hundredth of the chain's energy above the energy of hanging at rest."""
     (tmp_path / "pendulum.urdf").write_text(PENDULUM)
     robot = dc.Robot.load(
         tmp_path / "pendulum.urdf", actuation="torque", joint_positions=[0.5, 0.7]

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 kernels = pytest.importorskip("diffcloth_torch._kernels", reason="built with DIFFCLOTH_KERNELS")
 
-# None, small ones, to both sides of where the series ends, and large ones [rad].
+# Zero, small rotations, both sides of the switch from series to closed form, large ones [rad].
 TURNS = [0.0, 1e-9, 1e-3, 0.3, 0.4999, 0.5001, 0.9, 1.5, 2.0, 3.1, 5.0]
 
 
@@ -29,8 +29,8 @@ def oracle(w):
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_it_and_its_derivatives_are_those_of_matrix_exponentials(turn):
+def test_the_exponential_and_its_derivatives_match_matrix_exponentials(turn):
     for axis in np.random.default_rng(0).normal(size=(4, 3)):
         w = turn * axis / np.linalg.norm(axis)
-        # Rounding: the oracle alone leaves 1e-14 of large turns.
+        # Rounding: the oracle's own error is 1e-14 for large rotations.
         np.testing.assert_allclose(kernels.exponential(w), oracle(w), rtol=0, atol=5e-14)

@@ -48,7 +48,7 @@ def contact_steps(size, turn, seed, steps):
                 yield sim, state, after
             state = after
     except (dc.IntersectingState, dc.TurnedTooFar):
-        pass  # a throw that starts in the floor, or is spun up beyond what a step resolves
+        pass  # the throw starts in the floor, or its spin grows beyond the resolution of a step
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -64,14 +64,14 @@ def test_contact_gives_no_energy_to_what_turns_by_a_tenth_of_a_radian(size):
 
 
 def momentum(sim, state):
-    """Of the box; angular about its center."""
+    """Momentum of the box; the angular part is about its center."""
     linear, angular = sim.momentum(state).split(3)
     return torch.cat([linear, angular - torch.linalg.cross(state.body_poses[1, :3], linear)])
 
 
 @pytest.mark.parametrize("turn", [0.4, 0.8])
 def test_contact_gives_the_momentum_of_its_forces(turn):
-    """And nothing takes a part of it, however fast the box turns."""
+    """No part of the momentum is lost, at any angular speed of the box."""
     touched = 0
     for seed in range(6):
         for sim, before, after in contact_steps(SIZES[1], turn, seed, 8):
@@ -110,12 +110,12 @@ def test_gradients_of_a_step_that_touches_while_it_turns_fast(turn):
     ("inertia", "spin"),
     [
         ([0.2, 1.0, 1.1], [2.0, 1.5, -1.7]),
-        # No body's, but symmetric: its momentum turns so fast that all terms of the series count.
+        # No real body has this symmetric inertia: all terms of the series count for its momentum.
         ([0.009, 0.057, 1.0], [-2.2, 1.6, -0.54]),
     ],
 )
 def test_a_body_by_itself_turns_exactly(inertia, spin):
-    """At 3 rad a step as in many small steps; with what it keeps."""
+    """A step of 3 rad equals many small steps and conserves energy and momentum."""
     J = torch.diag(torch.tensor(inertia, dtype=F64))[None, None]
     spin = torch.tensor(spin, dtype=F64)
     momentum = (J[0, 0] @ spin).expand(1, 1, 3)
@@ -165,7 +165,7 @@ def test_energy_and_momentum_of_a_state_know_no_speed_limit(turn):
 
 
 def rolling(turn):
-    """A ball on a floor, and its state when it rolls by `turn` rad a step."""
+    """A ball on a floor, and its state when rolling by `turn` rad per step."""
     ball = dc.RigidBody.sphere(
         0.004, subdivisions=2, motion="dynamic", density=300, pose=[0, 0, 0.00406, 1, 0, 0, 0],
         friction=0.5, name="marble",
@@ -182,7 +182,7 @@ def rolling(turn):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_contact_seldom_gives_energy_to_what_turns_by_less_than_a_radian(size):
-    """As `python -m benchmarks.turns` counts; before, sticks gained eight times what they had."""
+    """Counted as in `python -m benchmarks.turns`; sticks once gained eight times their energy."""
     rises = []
     for turn in (0.3, 0.6):
         for seed in range(12):
@@ -196,7 +196,7 @@ def test_contact_seldom_gives_energy_to_what_turns_by_less_than_a_radian(size):
 
 
 def test_a_stick_that_contact_spins_up_fails():
-    """It turns slowly at the start, and by more than a radian at the end."""
+    """The stick turns slowly at the start, and by more than a radian per step at the end."""
     spun = 0
     for seed in range(30):
         try:
@@ -245,7 +245,7 @@ def test_the_environment_that_turns_too_fast_is_named():
 
 
 def test_the_environments_of_what_turns_too_far_by_itself_are_named():
-    """With the first such body in the first of them."""
+    """The message names the first such body of the first such environment."""
     boxes = [
         dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, pose=[k, 0, 0, 1, 0, 0, 0], name=name)
         for k, name in enumerate(("one", "other"))
@@ -298,7 +298,7 @@ def test_an_arm_that_spins_freely_keeps_its_energy(tmp_path, turn, elbow):
 
 @pytest.mark.parametrize("coupling", ["monolithic", "rigid_to_cloth", "cloth_to_rigid"])
 def test_a_robot_that_is_too_fast_by_itself_is_a_value_of_its_environment(tmp_path, coupling):
-    """It raised for the whole batch."""
+    """An earlier version raised for the whole batch."""
     file = tmp_path / "arm.urdf"
     file.write_text(ARM)
     arm = dc.Robot.load(file, actuation="torque", name="arm")
@@ -333,7 +333,7 @@ def test_a_robot_that_is_too_fast_by_itself_is_a_value_of_its_environment(tmp_pa
 
 
 def test_an_error_tells_of_failures_of_every_kind():
-    """It told nothing of what turns too far where another environment failed in another way."""
+    """An earlier version omitted too-fast rotations if another environment failed otherwise."""
     sheet = dc.Cloth.grid(3, 3, size=0.1, pose=[1, 0, 0.1, 1, 0, 0, 0], pins={"all": range(9)})
     sim, rolls = rolling(0.1)
     scene = dc.Scene([sheet], sim.scene.bodies, gravity=sim.scene.gravity)
@@ -346,5 +346,5 @@ def test_an_error_tells_of_failures_of_every_kind():
     with pytest.raises(dc.InfeasibleMotion) as error:
         sim.step(start.replace(body_velocities=velocities), dc.Control(pins=pins))
     assert error.value.environments == (2, 3)
-    blocked = ("infeasible_motion",) * 2  # whatever else happens there
+    blocked = ("infeasible_motion",) * 2  # reported first, whatever else fails there
     assert error.value.report.status == ("converged", "turned_too_far", *blocked)

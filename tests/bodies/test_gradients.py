@@ -8,7 +8,7 @@ from differences import difference
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 
-# Length of the direction along which an input moves; of parameters, as a share of their values.
+# Length of the perturbation of each input; for parameters, relative to their values.
 SCALES = {
     "state": {
         "positions": 2e-5,
@@ -48,7 +48,7 @@ SCALES = {
         "joint_slip_rates": 0.1,
     },
 }
-# What has no effect: the fingers slide, and forces on a base that does not float are refused.
+# Inputs without effect: the fingers slide, and forces on a base that does not float are refused.
 NOTHING = {
     "fixed": {
         "state": ("base_velocities",),
@@ -60,10 +60,10 @@ NOTHING = {
 }
 ADDED = ("body_center", "link_center")
 
-# Smaller derivatives, as by velocities of what is prescribed a step later, drown in the noise of
-# solves.
+# Smaller derivatives, such as by velocities of links that are prescribed in the next step, are
+# below the noise of the solves.
 RESOLVED = 1e-6
-# Steps of the differences, as shares of those directions: the best counts.
+# Steps of the difference quotients relative to the lengths in SCALES; the best result counts.
 SWEEP = (1e-3, 2e-4, 4e-5, 5e-3, 8e-6)
 
 SLOW = pytest.mark.slow
@@ -155,7 +155,7 @@ class Chain:
 
 
 def owner(kind):
-    """Which of the arguments of a step holds these inputs."""
+    """Name of the step's argument that holds inputs of this kind."""
     return "cloth" if kind == "bodies" else kind
 
 
@@ -179,7 +179,7 @@ def owner(kind):
     ],
 )
 def test_the_gradient_of_a_chain_is_that_of_differences(coupling, base, steps, kind):
-    """All inputs of a kind at once: a part that is wrong shows as soon as it counts."""
+    """All inputs of a kind are perturbed at once: any wrong part of the gradient shows."""
     chain = Chain(coupling, base, steps)
     inputs = chain.inputs(kind, base)
     assert chain.mismatch(kind, inputs, list(inputs)) < 1e-5
@@ -211,7 +211,7 @@ def test_the_stiffness_of_each_pair_has_its_gradient(coupling, base):
     fingers = "hand/left_finger", "hand/right_finger"
     assert touching == {fingers, *(("cloth0", other) for other in ("box", *fingers))}
     assert torch.equal(gradient, gradient.T)
-    # Along directions in what touches alone, where every term counts.
+    # Perturb only entries of touching pairs, where every term counts.
     chain.direction = lambda kind, name, x, g: (
         0.05 * x * (gradient != 0) * torch.randn(x.shape, dtype=F64, generator=g)
     )
@@ -221,7 +221,7 @@ def test_the_stiffness_of_each_pair_has_its_gradient(coupling, base):
 
 @pytest.mark.parametrize(("coupling", "base"), CASES)
 def test_everything_touches_and_rubs_along_the_whole_chain(coupling, base):
-    """Otherwise the other tests would prove little."""
+    """Premise of the other tests: without contact and friction they would prove little."""
     sim, start = coupled_scenes.in_contact(coupling, base)
     controls = coupled_scenes.controls(sim, coupled_scenes.control(sim), 15, coupled_scenes.WARM_UP)
     for state in sim.rollout(start, controls, coupled_scenes.parameters(sim)):

@@ -1,4 +1,4 @@
-"""Controls, states and parameters of bodies and robots: names, defaults, what is refused."""
+"""Controls, states and parameters of bodies and robots: names, defaults, refused values."""
 
 import numpy as np
 import pytest
@@ -137,7 +137,7 @@ def test_a_batch_takes_shared_and_own_values(layout, scene):
 
 
 @pytest.mark.parametrize("actuation", ["position", "velocity", "torque"])
-def test_a_gradient_by_what_moves_no_joint_is_refused(actuation):
+def test_a_gradient_by_values_that_move_no_joint_is_refused(actuation):
     robot = dc.Robot.load(dc.robots.GRIPPER, actuation=actuation)
     cloth = dc.Cloth.grid(2, 2, size=0.1, pose=[1, 0, 0, 1, 0, 0, 0])
     layout = Layout(assemble(dc.Scene([cloth], robots=[robot])))
@@ -272,7 +272,7 @@ def test_state_tensors_are_checked(layout, scene, field):
 
 
 def test_a_joint_beyond_the_zone_of_its_limit_is_refused(layout, scene):
-    """Of joints that forces move: turn has the range -1 .. 1.8, where the one that follows ends."""
+    """Joints that forces move: `turn` has the range -1 .. 1.8, at which its mimic joint ends."""
     state = make_state(scene)
 
     def at(*positions):
@@ -380,7 +380,7 @@ def test_a_link_that_is_given_mass_needs_an_inertia_that_is_not_negative(tmp_pat
             simulator.step(simulator.initial_state(), None, changed)
 
 
-def test_rows_of_what_forces_do_not_move_are_free(layout, defaults):
+def test_rows_of_bodies_that_no_force_moves_are_free(layout, defaults):
     given = dc.Parameters(
         body_mass=with_row(defaults["body_mass"], 0, 7.0),
         body_inertia=with_row(defaults["body_inertia"], 1, -1.0),
@@ -407,7 +407,7 @@ def test_batched_parameters_have_one_axis_more(layout, defaults):
 
 
 def test_a_link_that_is_a_point_keeps_its_parameters(tmp_path):
-    """It has no inertia of its own, but the link that a fixed joint joins it to has."""
+    """The point has no inertia of its own; the link attached by a fixed joint has one."""
     point = '<inertial><mass value="1"/></inertial>'
     arm = point.replace("/></", '/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></')
     parts = [f'<link name="{n}">{own}</link>' for n, own in (("base", ""), ("arm", arm))]

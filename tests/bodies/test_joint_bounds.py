@@ -15,7 +15,7 @@ TIGHT = dc.SolverOptions(tolerance=1e-10)
 H, G = 0.01, 9.81
 MASS, CENTER, OWN = 0.5, 0.2, 4e-3
 INERTIA = OWN + MASS * CENTER**2
-WEIGHT = MASS * G * CENTER  # moment where the arm is level
+WEIGHT = MASS * G * CENTER  # moment about the joint when the arm is level
 
 LINK = """
 <link name="{name}"><inertial><origin xyz="{center} 0 0"/><mass value="{mass}"/>
@@ -91,7 +91,7 @@ def test_a_joint_slips_under_what_is_beyond_its_friction(tmp_path, effort):
     end = rolled(simulator(robot, gravity=(0, 0, 0)), 20, joint_efforts=tensor(effort))[-1]
     speed = 20 * H * (effort - np.sign(effort) * 0.6) / INERTIA
     assert float(end.joint_velocities) == pytest.approx(speed, rel=1e-9)
-    # What is applied, without the friction.
+    # The applied effort, without the friction.
     assert float(end.joint_efforts) == effort
 
 
@@ -203,11 +203,11 @@ def test_a_drive_goes_as_fast_as_it_may(tmp_path):
     assert float(states[-1].joint_positions) < 1.2
 
 
-# --- What scales limits and slip ------------------------------------------------------------------
+# --- Scales of limits and slip --------------------------------------------------------------------
 
 
 def test_limits_and_slip_rates_know_all_that_a_joint_carries_where_it_starts(tmp_path):
-    """By hand, of two arms; the elbow of the second is bent."""
+    """Expected values by hand for two arms; the elbow of the second arm is bent."""
     bent, inertias = 2.0, np.array([0.01, 0.02, 0.03])
     arms = [
         dc.Robot.load(arm_file(tmp_path, len(q)), actuation="torque", joint_positions=q)
@@ -228,7 +228,7 @@ def test_limits_and_slip_rates_know_all_that_a_joint_carries_where_it_starts(tmp
 
 
 def test_arms_in_one_scene_have_limits_and_friction_of_their_own(tmp_path):
-    """In steps, and where they come to rest."""
+    """Both in steps and in the equilibrium of the scene."""
     arms, moves = [], []
     for k, (links, friction) in enumerate(((1, 0.3), (2, [1.5, 0.8]))):
         path = arm_file(tmp_path, links, effort=1 + k, velocity=1.2 + k, friction=friction)
@@ -257,7 +257,7 @@ def test_arms_in_one_scene_have_limits_and_friction_of_their_own(tmp_path):
 
 
 def test_a_joint_that_mimics_acts_on_its_leader_by_virtual_work(tmp_path):
-    """The second joint turns twice as far back: what holds it counts twice, against the sum."""
+    """The second joint turns back twice as far, so its friction and limits count twice."""
     path = arm_file(tmp_path, 2, effort=[1, 2], friction=[0.2, 0.3], mimic={1: -2.0})
     robot = dc.Robot.load(path, actuation="torque")
     sim = simulator(robot, gravity=(0, 0, 0))
@@ -279,7 +279,7 @@ def test_a_joint_that_mimics_acts_on_its_leader_by_virtual_work(tmp_path):
 
 
 def test_accelerations_are_those_of_pinocchio_with_friction_and_limits(tmp_path):
-    """Three joints that slide, the first one with more effort than it may have."""
+    """Three joints with sliding friction; the first effort exceeds its limit."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
     path = arm_file(tmp_path, 3, effort=[2, 9, 9], friction=[0.3, 0.2, 0.1])
     robot = dc.Robot.load(path, actuation="torque", joint_positions=[0.3, -0.5, 0.8])
@@ -361,7 +361,7 @@ def test_gradients_in_every_regime_are_central_differences(tmp_path, mode, name)
         for k in range(2):
             step = 1e-6 * torch.nn.functional.one_hot(torch.tensor(k), 2).to(F64)
             if float(value[k]) == 0.0 and n == "joint_friction":
-                continue  # at the end of its range
+                continue  # zero friction is the end of the range
             with torch.no_grad():
                 ends = [
                     loss_of(sim, mode, start, inputs | {n: value + s * step}) for s in (1.0, -1.0)
@@ -425,15 +425,15 @@ def test_environments_have_limits_of_their_own_with_the_bits_that_they_have_alon
 
 
 def test_friction_holds_an_arm_where_the_search_begins(tmp_path):
-    """As far as it goes: a joint yields up to the slip at which it slides, and stays there."""
+    """Regularized friction: the joint yields up to the slip that carries the load, and stays."""
     robot = dc.Robot.load(arm_file(tmp_path, friction=1.2 * WEIGHT), actuation="torque")
     sim = simulator(robot)
     found = sim.equilibrium(sim.initial_state())
     slip = float(sim.default_parameters().joint_slip_rates) * H
     share = float(found.joint_positions) / slip
-    # It yields by 6e-7 rad, which the solver finds up to its tolerance.
+    # The joint yields by 6e-7 rad, which the solver finds up to its tolerance.
     assert share * (2.0 - share) == pytest.approx(1.0 / 1.2, rel=1e-5)
-    # With less, it falls until friction holds what is left of the weight.
+    # With less friction the arm falls until friction balances the moment of the weight.
     robot = dc.Robot.load(arm_file(tmp_path, friction=0.5 * WEIGHT), actuation="torque")
     found = simulator(robot).equilibrium(sim.initial_state())
     assert WEIGHT * np.cos(float(found.joint_positions)) == pytest.approx(0.5 * WEIGHT, rel=1e-6)
@@ -472,7 +472,7 @@ def test_gradients_of_an_equilibrium_by_limits_friction_and_start(tmp_path):
 
 
 def test_an_arm_rests_on_its_limit_where_a_rollout_leaves_it(tmp_path):
-    """The barrier there is that of the time step, not of the long steps of the search."""
+    """The barrier uses the simulator's time step, not the long steps of the search."""
     path = arm_file(tmp_path)
     path.write_text(path.read_text().replace('upper="20"', 'upper="0.3"'))
     sim = simulator(dc.Robot.load(path, actuation="torque"))
@@ -498,7 +498,7 @@ def test_a_limit_of_the_speed_does_not_slow_the_way_to_an_equilibrium(tmp_path):
 
 
 def test_friction_that_turns_round_takes_few_iterations(tmp_path):
-    """Duals remember the other side of its kink; without them, Newton's method crosses it."""
+    """Dual variables store the other side of the kink, which plain Newton steps would cross."""
     path = arm_file(tmp_path, 3, friction=[1.0, 0.7, 0.4])
     robot = dc.Robot.load(path, stiffness=40.0, damping=2.0)
     sim = dc.Simulator(

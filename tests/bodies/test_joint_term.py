@@ -1,4 +1,4 @@
-"""The energy of a joint's term against the integral of its force, and that against differences."""
+"""A joint term's energy against the integral of its force; its curvature against differences."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ROWS = {
 }
 # Within the limit of the speed, on both sides of all others.
 SLIPS = [-0.1005, -0.06, -0.02, 0.001, 0.005, 0.033, 0.1005]
-# Where one of its parts begins or ends.
+# Slips at which a part of the joint term begins or ends.
 KINKS = [-0.1, -0.03, -0.015, 0.0, 0.03, 0.1]
 
 

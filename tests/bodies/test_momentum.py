@@ -1,4 +1,4 @@
-"""What cloths, bodies and robots do to each other is equal and opposite."""
+"""Forces between cloths, bodies and robots are equal and opposite."""
 
 import coupled_scenes
 import numpy as np
@@ -16,7 +16,7 @@ EXACT = 1e-9  # [N], [N m], [kg m/s], beside forces of up to 1 N
 
 
 def placed(sim, state):
-    """Vertices of all bodies and links, as `body_forces` has them."""
+    """Vertices of all bodies and links, in the order of `body_forces`."""
     parts = [
         torch.tensor(body.vertices) @ frame[:3, :3].T + frame[:3, 3]
         for body, frame in zip(sim.scene.bodies, matrices(state.body_poses), strict=True)
@@ -31,14 +31,14 @@ def placed(sim, state):
 
 
 def resultant(points, forces):
-    """Sum of the forces, and of their torques about the origin."""
+    """Sum of the forces and sum of their torques about the origin."""
     return torch.cat([forces.sum(0), cross(points, forces).sum(0)])
 
 
 def on_cloth(sim, before, after, outer):
-    """What contact does to the cloth: its inertia less other forces, elastic ones adding to zero.
+    """Resultant of contact on the cloth: inertial less external forces; elastic ones cancel.
 
-    `outer` are forces on its vertices.
+    `outer` are external forces on the vertices.
     """
     inertia = cloth_masses(sim)[:, None] * (after.velocities - before.velocities) / DT
     return resultant(after.positions, inertia - outer)
@@ -62,7 +62,7 @@ def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
             other_side = resultant(placed(sim, after), after.body_forces)
             assert cloth_side[:3].norm() > 0.01
             assert (cloth_side + other_side)[:3].abs().max() < EXACT
-            # In `cloth_to_rigid` the forces of the cloth act where bodies have been.
+            # In `cloth_to_rigid` the cloth's forces act at the start poses of the bodies.
             if friction == 0.0 and coupling != "cloth_to_rigid":
                 assert (cloth_side + other_side)[3:].abs().max() < EXACT
             state = after
@@ -70,7 +70,7 @@ def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_floating_gripper_takes_up_the_impulse_of_contact(coupling):
-    """To rounding, whatever its joints do."""
+    """The momentum balance holds to rounding, for any motion of the joints."""
     sim, state = coupled_scenes.in_contact(coupling, "floating")
     given, control = coupled_scenes.parameters(sim), coupled_scenes.control(sim)
     weight = given.link_mass.sum() * given.gravity
@@ -99,7 +99,7 @@ def spins(sim, state):
 
 
 def turned_by_contact(sim, after, where):
-    """Its change in a step, from the contact forces where they act."""
+    """Change of spin in a step, from the contact forces at the poses of `where`."""
     wrenches = sim.contact_wrenches(where.replace(body_forces=after.body_forces))
     return DT * torch.stack([wrenches[name][3:] for name in sim.surfaces if name in wrenches])
 
@@ -172,7 +172,7 @@ def test_boxes_that_collide_keep_their_momentum(friction):
     sim = dc.Simulator(
         dc.Scene([], boxes, gravity=(0, 0, 0)),
         DT,
-        # With a smaller slip velocity the tolerance of the solver leaves more of friction's forces.
+        # A smaller slip velocity would increase the error in friction that the tolerance allows.
         contact=dc.ContactOptions(barrier_distance=0.004, slip_velocity=1e-4),
         solver=dc.SolverOptions(tolerance=1e-12),
     )
@@ -233,7 +233,7 @@ def center_of_mass(sim, state):
 
 
 def stroke(time):
-    """Not the same there and back, into limits of efforts, speeds and joints."""
+    """Asymmetric strokes that reach the limits of efforts, speeds and joints."""
     turn = torch.tensor([[1.2, 0.6], [-1.0, 0.6], [1.2, -0.4], [0.0, 0.0]][int(time / 0.5)])
     turn = turn.to(F64)
     return dc.Control(joint_positions=turn, joint_velocities=0.2 * turn, joint_efforts=turn)
@@ -242,7 +242,7 @@ def stroke(time):
 @pytest.mark.parametrize("actuation", ["pd", ("pd", "position"), ("torque", "velocity")])
 @pytest.mark.quick("pd")
 def test_a_robot_in_empty_space_keeps_its_momentum(tmp_path, actuation):
-    """All six numbers; its center of mass goes astray by what the metric of a solve is off."""
+    """All six components; the center of mass drifts by the error of the solve's metric."""
     astray = []
     for dt in (0.02, 0.01):
         sim = swimmer(tmp_path, dt, actuation=actuation)
@@ -279,7 +279,7 @@ def test_a_robot_that_strikes_a_box_keeps_their_momentum(tmp_path, friction):
 
     for k in range(60):
         after = sim.step(state, stroke(k * 0.01))
-        # Forces act where bodies and the root are at the end.
+        # Forces act at the final poses of the bodies and of the root.
         was, now = state.body_velocities[0, :3], after.body_velocities[0, :3]
         change = sim.momentum(after) - sim.momentum(state)
         change[3:] -= 0.01 * mass * cross(now, was)

@@ -4,7 +4,8 @@ import pytest
 import torch
 from bodies.coupled_scenes import COUPLINGS, control, in_contact, parameters
 
-# Of differences; fingers at the limit of their speed hardly feel their viscosity.
+# Steps of the differences; the last is larger because fingers at their velocity limit hardly
+# depend on their viscosity.
 STEPS = [1e-5] * 4 + [1e-3]
 
 

@@ -1,4 +1,4 @@
-"""Robots that something holds at rest: what holds them balances their weight, at any time step."""
+"""Robots at rest: the holding forces balance the weight at any time step."""
 
 import math
 
@@ -69,7 +69,7 @@ def rest(sim, control, seconds):
     ids="-".join,
 )
 def test_drives_carry_the_weight(tmp_path, kinds, dt):
-    """They were off by 4 % at 20 ms, whatever their stiffness: products of a fall that is none."""
+    """Velocity products of a nonexistent fall once changed efforts by 4 % at 20 ms."""
     file = write(tmp_path, kinds)
     robot = dc.Robot.load(file, stiffness=300.0, damping=20.0, name="arm")
     solver = dc.SolverOptions(tolerance=1e-10)
@@ -87,7 +87,7 @@ def test_drives_carry_the_weight(tmp_path, kinds, dt):
 
 @pytest.mark.parametrize("dt", [0.02, 0.005])
 def test_a_floor_carries_a_limp_arm(tmp_path, dt):
-    """By virtual work at its first joint, which nothing drives."""
+    """By virtual work at the first joint, which has no drive."""
     file = write(tmp_path, ["revolute", "revolute"], rpy="0 0 0", tip=TIP)
     robot = dc.Robot.load(
         file,
@@ -115,7 +115,7 @@ def test_a_floor_carries_a_limp_arm(tmp_path, dt):
 @pytest.mark.quick("0.02")
 @pytest.mark.parametrize("dt", [0.02, 0.005])
 def test_drives_on_a_base_that_stands_carry_the_weight(tmp_path, dt):
-    """It floats, and falls as a whole; its floor holds it."""
+    """The floating base would fall with the arm; the floor supports the base."""
     file = write(tmp_path, ["revolute", "revolute"], rpy="0 0 0")
     foot = """<link name="base"><inertial><mass value="5"/>
       <inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -148,7 +148,7 @@ def test_drives_on_a_base_that_stands_carry_the_weight(tmp_path, dt):
 
 @pytest.mark.parametrize("speed", [0.05, 0.2, 1.0])
 def test_an_arm_sags_alike_on_a_base_that_glides(tmp_path, speed):
-    """Steady motion changes nothing, up to what a step leaves of velocity products."""
+    """Steady motion has no effect, up to the step's error in velocity products."""
     file, ways = write(tmp_path, ["revolute", "revolute"]), []
     glide = speed * torch.tensor([1.0, 0.0, 0.5], dtype=F64)
     for base in ("fixed", "kinematic"):

@@ -1,4 +1,4 @@
-"""A step of a robot costs the same however long the rollout before it, with a graph too."""
+"""The cost of a robot's step is independent of the length of the rollout, also with a graph."""
 
 import time
 
@@ -27,7 +27,7 @@ def rollout(base, steps, **options):
 
 @pytest.fixture
 def solves(monkeypatch):
-    """What this thread had computed when it called the core [s], in order."""
+    """CPU times of this thread at its calls of the core [s], in order."""
     times, solve = [], engine.take_step
 
     def timed(*args, **keywords):
@@ -43,7 +43,7 @@ def solves(monkeypatch):
 @pytest.mark.parametrize("checkpoint_every", [None, STEPS, 30])
 @pytest.mark.slow
 def test_the_last_step_of_a_rollout_takes_the_time_of_the_first(base, checkpoint_every, solves):
-    rollout(base, WINDOW, checkpoint_every=checkpoint_every)  # what torch does once
+    rollout(base, WINDOW, checkpoint_every=checkpoint_every)  # warm-up of torch
     rollouts = []
     for _ in range(3):
         solves.clear()

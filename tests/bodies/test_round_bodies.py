@@ -1,4 +1,4 @@
-"""Smooth spheres and capsules: they roll, rest and hold cloth as what they are."""
+"""Smooth spheres and capsules roll, rest and carry cloth as the exact surfaces do."""
 
 import math
 import pickle
@@ -60,7 +60,7 @@ ROLLING = {
 
 
 @pytest.mark.parametrize("name", ROLLING)
-def test_it_rolls_down_an_incline_as_round_bodies_do(name):
+def test_a_smooth_body_rolls_down_an_incline_as_round_bodies_do(name):
     """Acceleration g sin / (1 + I / (m r^2)), up to the order of h, and spin v / r.
 
     r counts from the surface of the incline, which is half the barrier distance away.
@@ -77,8 +77,9 @@ def test_it_rolls_down_an_incline_as_round_bodies_do(name):
         speed = float(velocity[:3] @ torch.tensor(downhill))
         expected = seconds * G * math.sin(angle) / (1 + moment * (0.05 / radius) ** 2)
         errors.append(speed / expected - 1)
-        # It creeps as far below the slip velocity as friction is below its most; and in a step that
-        # turns it by phi, the arm of friction turns too: cos(phi) of it counts.
+        # The body creeps below the slip velocity according to the ratio of friction to its bound.
+        # In a step that rotates the body by phi, friction's arm rotates too: a share cos(phi) of
+        # the arm counts.
         spin = float(velocity[4])
         share = moment / (1 + moment) * math.tan(angle) / 0.6
         creep = 1e-3 * (1 - math.sqrt(1 - share))
@@ -93,7 +94,7 @@ def test_it_rolls_down_an_incline_as_round_bodies_do(name):
 
 @pytest.mark.parametrize(("rings", "least", "most"), [(5, -0.03, -0.01), (10, -0.01, 0.01)])
 def test_a_cylinder_of_many_sides_rolls_nearly_as_a_round_one(rings, least, most):
-    """It starts on a side. A round one would be faster by the gap over the radius, 1 %."""
+    """The cylinder starts on a side. A round one would be faster by gap / radius, 1 %."""
     angle, seconds = 0.3, 0.4
     side = math.tau / (6 * rings)
 
@@ -109,8 +110,8 @@ def test_a_cylinder_of_many_sides_rolls_nearly_as_a_round_one(rings, least, most
     assert least < speed / (seconds * G * math.sin(angle) / 1.5) - 1 < most
 
 
-def test_it_rolls_on_another_round_body():
-    """Down from the top of a ball that stands: by its own share of the gap, and by energy."""
+def test_a_smooth_ball_rolls_on_another_round_body():
+    """A ball rolls down from the top of a fixed ball, according to its gap share and energy."""
     large = dc.RigidBody.sphere(0.4, smooth=True, friction=0.8)
     start = 0.3
     gap = D_HAT / 2
@@ -124,7 +125,7 @@ def test_it_rolls_on_another_round_body():
     way = at_end.norm()
     speed, spin = end.body_velocities[1, :3].norm(), end.body_velocities[1, 4]
     assert at_end[0] > at[0] + 0.03
-    # Each rolls on its share of the distance between the centers.
+    # Each ball's rolling radius is its share of the distance between the centers.
     assert float(spin) == pytest.approx(float(speed / (way * 0.05 / 0.45)), rel=3e-3)
     gained = G * (at[2] - float(at_end[2]))
     inertia = 2 / 5 * 0.05**2
@@ -132,7 +133,7 @@ def test_it_rolls_on_another_round_body():
 
 
 def test_spin_passes_from_one_round_body_to_another():
-    """Of two equal balls that touch in free fall, one turns: both then turn oppositely."""
+    """Two equal balls touch in free fall; one spins, and friction spins the other oppositely."""
     gap = 0.4 * D_HAT
     balls = [
         dc.RigidBody.sphere(
@@ -155,7 +156,7 @@ def test_spin_passes_from_one_round_body_to_another():
     assert after.report.contact_count == 1
     spins = after.body_velocities[:, 5]
     assert spins[1] < -0.01
-    # Friction acts in the middle between both, so that both feel the same torque.
+    # Friction acts midway between the balls, so both receive the same torque.
     torch.testing.assert_close(spins[0] - 3.0, spins[1], rtol=1e-3, atol=0)
     for at in (before, after):
         momentum = 0.2 * at.body_velocities[:, :3].sum(dim=0)
@@ -163,13 +164,13 @@ def test_spin_passes_from_one_round_body_to_another():
     inertia = 2 / 5 * 0.2 * 0.05**2
     angular = 0.2 * torch.linalg.cross(after.body_poses[:, :3], after.body_velocities[:, :3])
     total = angular.sum(dim=0)[2] + inertia * spins.sum()
-    # Of what friction passes on, up to how much of the slip is not tangential.
+    # Relative to the spin that friction transfers; the error is the non-tangential part of slip.
     assert float(total / inertia - 3.0) == pytest.approx(0.0, abs=0.02 * float(spins[1].abs()))
 
 
 @pytest.mark.parametrize("lies", [True, False], ids=["along", "across"])
 def test_a_capsule_rests_on_two_boxes(lies):
-    """Its ends on their tops, or its side on their edges; each carries half of it."""
+    """The ends lie on the boxes' tops, or the side on their edges; each box carries half."""
     along = Rotation.from_euler("y", math.pi / 2)
     boxes = [
         dc.RigidBody.box([0.1, 0.3, 0.1], pose=[x, 0, -0.05, 1, 0, 0, 0], name=name)
@@ -205,7 +206,7 @@ def test_a_capsule_rests_on_two_boxes(lies):
 
 
 def test_mass_properties_are_those_of_the_analytic_body():
-    """Of meshes they come closer as these become finer."""
+    """The properties of finer meshes converge to the analytic values."""
     sphere = dc.RigidBody.sphere(0.3, smooth=True, motion="dynamic", density=200.0)
     mass = 200 * 4 / 3 * math.pi * 0.3**3
     assert sphere.mass == pytest.approx(mass, rel=1e-14)
@@ -231,7 +232,7 @@ def test_mass_properties_are_those_of_the_analytic_body():
 
 
 def heap():
-    """A sheet on a capsule that stands; on the sheet a ball, against it another one and a box."""
+    """A sheet on a fixed capsule; on the sheet a ball, touched by another ball and a box."""
     X, faces = scenes.grid(5, 5, edge=0.06, seed=2)
     X = X - X.mean(axis=0)
     material = scenes.material(faces, stretch=200.0, thickness=1e-3)
@@ -277,7 +278,7 @@ def in_contact():
 
 
 def test_everything_in_the_heap_touches(in_contact):
-    """Otherwise what follows would prove little."""
+    """Premise of the tests below: without contact they would prove little."""
     sim, state = in_contact
     pairs = {tuple(pair) for pair in sim.step(state).report.contacts}
     expected = {
@@ -328,7 +329,7 @@ def test_gradients_are_central_differences(in_contact, name):
     step = (STATE | PARAMETERS)[name]
     for d in directions(value.detach(), torch.Generator().manual_seed(5)):
         if name.startswith("body_") and name in PARAMETERS:
-            d[0] = 0  # what stands has no mass
+            d[0] = 0  # the fixed capsule has no mass
         if name == "body_inertia":
             d = 0.5 * (d + d.mT) * given.body_inertia.diagonal(dim1=-2, dim2=-1).mean()
         with torch.no_grad():
@@ -345,7 +346,7 @@ def test_tangents_are_the_transpose_of_gradients(in_contact):
 
 
 def drape(body, n=16, steps=40, **keywords):
-    """A sheet that falls onto a body below it; sim and states of every step."""
+    """A sheet falls onto a body; the simulator and the state of every step."""
     cloth = dc.Cloth.grid(n, n, size=0.5)
     sim = dc.Simulator(dc.Scene([cloth], [body]), 0.01, **keywords)
     with torch.no_grad():
@@ -364,7 +365,7 @@ def below(kind, radius=0.12, **keywords):
 
 
 def distance(x, faces, ends):
-    """Of a skeleton from triangles, all of each."""
+    """Distance between a skeleton (a point or a segment) and triangles [m]."""
     smallest = min(ipctk.point_triangle_distance(p, *x[f]) for p in ends for f in faces)
     if len(ends) == 2:
         edges = {tuple(sorted((f[k], f[k - 1]))) for f in faces for k in range(3)}
@@ -383,13 +384,13 @@ def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
     gaps = [distance(state.positions.numpy(), faces, ends) - 0.12 for state in states]
     assert min(gaps) > 0
     assert gaps[-1] < float(sim.default_parameters().barrier_distance)
-    # The report says the same of what is in contact.
+    # The report has the same minimum distance whenever a pair is in contact.
     reported = [float(state.report.minimum_distance) for state in states]
     touching = [k for k, value in enumerate(reported) if math.isfinite(value)]
     assert len(touching) > 20
     for k in touching:
         assert reported[k] == pytest.approx(gaps[k], abs=1e-12)
-    # As do the contacts, point by point.
+    # The contact points have the same gap.
     contacts = sim.contacts(states[-1]).on(sim.scene.body_names[0])
     assert float(contacts.gaps[contacts.mask].min()) == pytest.approx(gaps[-1], abs=1e-12)
     skin = contacts.points[contacts.mask][:, 1].numpy()
@@ -397,13 +398,13 @@ def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
     share = np.clip((skin - ends[0]) @ axis / max(axis @ axis, 1e-300), 0, 1)
     from_axis = np.linalg.norm(skin - ends[0] - share[:, None] * axis, axis=1)
     assert from_axis.max() < 0.12 * (1 + 1e-12)
-    # Where both the axis and one of its ends act, the sphere around the end lies within.
+    # If both the axis and one of its ends act, the sphere around the end lies within.
     assert from_axis.min() > 0.12 * ((1 - 1e-12) if len(ends) == 1 else 0.999)
 
 
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
-def test_it_carries_the_weight_of_the_cloth(kind):
-    """At rest; the sheet is held in place by friction."""
+def test_a_smooth_body_carries_the_weight_of_the_cloth(kind):
+    """At rest, friction holds the sheet in place and the body carries its weight."""
     body, _ = below(kind, smooth=True, friction=2.0)
     sim, states = drape(body, n=10, solver=dc.SolverOptions(tolerance=1e-7))
     state = sim.equilibrium(states[-1])
@@ -412,7 +413,7 @@ def test_it_carries_the_weight_of_the_cloth(kind):
 
 
 def raised(body, seconds=0.4, height=0.06, n=10):
-    """A sheet that is pinned all around, with a body that rises below it, and stays."""
+    """A sheet pinned at its rim over a body that rises and then stays."""
     cloth = dc.Cloth.grid(n, n, size=0.5)
     x = np.array(cloth.vertices)
     rim = np.flatnonzero(np.abs(x[:, :2]).max(axis=1) > 0.249)
@@ -430,8 +431,8 @@ def raised(body, seconds=0.4, height=0.06, n=10):
     return sim, state
 
 
-def test_a_fine_mesh_comes_closer_to_it():
-    """Where a taut sheet comes to rest on a sphere, against meshes of it."""
+def test_finer_meshes_converge_to_the_smooth_body():
+    """Rest positions of a taut sheet on a smooth sphere, against meshes of the sphere."""
     ends = []
     for keywords in ({"smooth": True}, *({"subdivisions": k} for k in (1, 2, 4))):
         body, _ = below("sphere", motion="kinematic", friction=0.0, **keywords)
@@ -445,7 +446,7 @@ BELT = {"radius": 0.1, "width": 0.12, "length": 0.5, "tension": 1.0, "kappa": 20
 
 
 def belt(columns, rows, jitter):
-    """A belt over half a capsule, pinned at one end and pulled at the other, with no friction."""
+    """A belt over half a capsule, pinned at one end, pulled at the other, without friction."""
     radius, width, length, tension, kappa, d_hat = BELT.values()
     X, faces = scenes.grid(rows, columns, edge=1.0, seed=1, jitter=jitter)
     X = X * [length / (columns - 1), width / (rows - 1), 0]
@@ -481,7 +482,7 @@ def belt(columns, rows, jitter):
 
 
 def gap_under(share):
-    """Where a share of a quarter of the barrier carries the pressure of the belt."""
+    """Gap at which the share `share` of a quarter of the barrier carries the belt's pressure."""
     radius, width, _, tension, kappa, d_hat = BELT.values()
     low, high = 0.0, d_hat
     for _ in range(60):
@@ -501,17 +502,17 @@ def test_the_gap_under_a_pressure_does_not_know_the_mesh_of_the_cloth(jitter):
         sim, state = belt(columns, rows, jitter)
         contacts = sim.contacts(state)
         forces = contacts.normal_forces
-        # Half a turn of it: T / r per length, all around.
+        # Half a turn of the belt with T / r per length in all directions.
         expected = math.pi * BELT["tension"]
         assert float(forces.sum()) == pytest.approx(expected, rel=5e-3)
         gaps.append(float((contacts.gaps * forces).sum() / forces.sum()))
-    # Pressure is uneven where edges are, but no less is carried by them than on the grid.
+    # Pressure is uneven at edges of an irregular mesh, but its sum is the same as on the grid.
     np.testing.assert_allclose(gaps, gap_under(2 / 3), rtol=0.03 if jitter else 5e-3)
     assert np.ptp(gaps) < (0.04 if jitter else 1e-3) * np.mean(gaps)
 
 
-def test_what_a_sheet_does_does_not_know_how_a_sphere_is_turned():
-    """Facets of a mesh do show."""
+def test_the_orientation_of_a_sphere_does_not_change_a_sheet():
+    """The facets of a mesh do have an effect."""
     spreads = []
     for keywords in ({"smooth": True}, {"subdivisions": 1}):
         ends = []
@@ -531,7 +532,7 @@ def test_what_a_sheet_does_does_not_know_how_a_sphere_is_turned():
 
 
 def test_a_loss_has_no_facets():
-    """Third differences along a sweep of a capsule's heading: facets would make them large."""
+    """Third differences along a sweep of a capsule's heading, which facets would increase."""
 
     def end(heading, **keywords):
         turn = quaternion(Rotation.from_euler("ZYX", [heading, 1.45, 0]))
@@ -554,7 +555,7 @@ def test_a_loss_has_no_facets():
 
 
 def thrown(kind, radius, thickness):
-    """A body thrown onto a sheet, whose mass does not know its radius: a loss, and its gradient."""
+    """A loss and its gradient for a body thrown onto a sheet; its mass ignores its radius."""
     moments = 1e-3 * np.eye(3)
     keywords = {"motion": "dynamic", "mass": 0.2, "center": [0, 0, 0], "inertia": moments}
     keywords |= {"smooth": True, "thickness": thickness, "friction": 0.5}
@@ -586,7 +587,7 @@ def thrown(kind, radius, thickness):
 
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
 def test_thickness_of_a_body_on_cloth_is_radius(kind):
-    """So that twice the gradient by thickness is that by the radius."""
+    """Twice the gradient by thickness therefore equals the gradient by radius."""
     whole, _, gradient = thrown(kind, 0.05, 2e-3)
     part, _, same = thrown(kind, 0.045, 12e-3)
     for field in ("positions", "body_poses", "body_velocities", "contact_forces"):
@@ -615,7 +616,7 @@ def test_bits_do_not_depend_on_threads_or_batches(in_contact, threads):
 
 @pytest.mark.parametrize("height", [-0.15, 0.01], ids=["within", "across"])
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
-def test_what_overlaps_at_the_start_is_named(kind, height):
+def test_smooth_bodies_that_overlap_at_the_start_are_named(kind, height):
     keywords = {"smooth": True, "pose": [0.03, 0.01, height, 1, 0, 0, 0], "name": "it"}
     if kind == "sphere":
         body = dc.RigidBody.sphere(0.2, **keywords)
@@ -627,7 +628,7 @@ def test_what_overlaps_at_the_start_is_named(kind, height):
 
 
 @pytest.mark.parametrize("apart", [0.25, 0.35])
-def test_two_of_them_overlap_by_what_their_radii_say(apart):
+def test_smooth_bodies_overlap_according_to_their_radii(apart):
     balls = [
         dc.RigidBody.sphere(
             radius, smooth=True, motion="dynamic", mass=0.3, pose=[x, 0, 0, 1, 0, 0, 0]
@@ -642,8 +643,8 @@ def test_two_of_them_overlap_by_what_their_radii_say(apart):
         dc.Simulator(dc.Scene([], balls), 0.01, contact=options)
 
 
-def test_something_can_be_attached_to_it():
-    """At a point of its frame, wherever it turns to."""
+def test_an_attachment_to_a_smooth_body_holds():
+    """The attachment point is fixed in the body's frame and rotates with the body."""
     ball = dc.RigidBody.sphere(
         0.1, smooth=True, motion="dynamic", mass=0.3, pose=[0, 0, -0.3, 1, 0, 0, 0], name="ball"
     )
@@ -658,7 +659,7 @@ def test_something_can_be_attached_to_it():
             state = sim.step(state.replace(body_velocities=0.9 * state.body_velocities))
     wrench = sim.contact_wrenches(state)["ball"]
     assert float(wrench[2]) == pytest.approx(0.3 * G, rel=1e-2)
-    # It hangs by the point, with its center below.
+    # The ball hangs by the point, with its center below.
     w, x, y, z = state.body_poses[0, 3:].tolist()
     arm = Rotation.from_quat([x, y, z, w]).apply([0.06, 0.0, 0.08])
     np.testing.assert_allclose(arm[:2], 0, atol=5e-3)
@@ -667,8 +668,8 @@ def test_something_can_be_attached_to_it():
 
 @pytest.mark.parametrize("coupling", ["monolithic", "rigid_to_cloth", "cloth_to_rigid"])
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
-def test_couplings_agree_on_it(coupling):
-    """A heavy ball falls onto a sheet over a capsule: all of them hold it up there."""
+def test_couplings_agree_on_smooth_bodies(coupling):
+    """A heavy ball falls onto a sheet over a capsule: every coupling supports the ball."""
     ball = dc.RigidBody.sphere(
         0.06, smooth=True, motion="dynamic", density=3000.0, pose=[0.02, 0.01, 0.08, 1, 0, 0, 0]
     )
@@ -682,7 +683,7 @@ def test_couplings_agree_on_it(coupling):
     assert state.body_forces.shape == (8, 3)
 
 
-def test_it_is_drawn_and_exported_as_its_mesh(tmp_path):
+def test_a_smooth_body_is_drawn_and_exported_as_its_mesh(tmp_path):
     ball = dc.RigidBody.sphere(0.1, subdivisions=1, smooth=True, pose=[0, 0, -0.11, 1, 0, 0, 0])
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(6, 6, size=0.3)], [ball]), 0.01)
     state = sim.rollout(sim.initial_state(), steps=20)[-1]
@@ -697,7 +698,7 @@ def test_it_is_drawn_and_exported_as_its_mesh(tmp_path):
     assert repr(kept) == "RigidBody(static, 80 faces, smooth)"
 
 
-def test_what_cannot_be_smooth_is_refused():
+def test_bodies_that_cannot_be_smooth_are_refused():
     with pytest.raises(dc.InvalidInput, match=r"RigidBody\.capsule can be smooth"):
         dc.RigidBody.cylinder(0.1, 0.2, smooth=True)
     with pytest.raises(dc.InvalidInput, match="`smooth` must not be set with `nodal_contact`"):
@@ -718,8 +719,8 @@ def test_split_steps_are_those_of_the_same_sum():
     torch.testing.assert_close(*(end.positions for end in ends), atol=1e-5, rtol=0)
 
 
-def test_projective_steps_touch_the_same_surface_without_it():
-    """All contact is at nodes there, with the analytic surface in any case."""
+def test_projective_steps_touch_the_smooth_surface_in_any_case():
+    """The projective scheme's contact is nodal and always uses the analytic surface."""
     ends = []
     for smooth in (True, False):
         body, _ = below("sphere", smooth=smooth)

@@ -1,4 +1,4 @@
-"""Links whose spheres touch as spheres: they do what smooth bodies of the same poses do."""
+"""Links with smooth spheres behave as smooth bodies of the same poses."""
 
 import math
 import pickle
@@ -38,7 +38,7 @@ def finger(folder, shapes=ROD + TIP, base="", **keywords):
 
 
 def alone(folder, **keywords):
-    """A ball that is a link, off the origin of its frame, on a floating base."""
+    """A ball as the only link of a floating base, off the origin of the link's frame."""
     mass = 500 * 4 / 3 * math.pi * RADIUS**3
     moment = 2 / 5 * mass * RADIUS**2
     path = folder / "ball.urdf"
@@ -73,7 +73,7 @@ def test_a_sphere_alone_is_the_link_and_one_beside_others_a_link_of_its_own(tmp_
     np.testing.assert_array_equal(robot.mechanism.mass, [0.4, 0.4, 0, 0])
 
 
-def test_of_several_spheres_the_first_is_the_link(tmp_path):
+def test_the_first_of_several_spheres_is_the_link(tmp_path):
     robot = finger(tmp_path, TIP + KNOB)
     assert robot.link_names == ("base", "finger", "finger/1")
     np.testing.assert_allclose(robot.skeletons["finger"].vertices[0], [0.3, 0, 0.01])
@@ -86,7 +86,7 @@ def test_names_choose_links(tmp_path):
     assert finger(tmp_path, smooth={"finger": False}).link_names == ("base", "finger")
 
 
-def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
+def test_options_of_a_link_apply_to_its_spheres(tmp_path):
     robot = finger(
         tmp_path,
         ROD + TIP + KNOB,
@@ -113,12 +113,12 @@ def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
         (ROD + TIP, "finger", TypeError, "`smooth` must be True or False, got str"),
     ],
 )
-def test_what_cannot_be_smooth_is_refused(tmp_path, shapes, smooth, error, message):
+def test_links_that_cannot_be_smooth_are_refused(tmp_path, shapes, smooth, error, message):
     with pytest.raises(error, match=message):
         finger(tmp_path, shapes, smooth=smooth)
 
 
-def test_it_pickles(tmp_path):
+def test_a_robot_with_smooth_links_pickles(tmp_path):
     again = pickle.loads(pickle.dumps(finger(tmp_path)))
     np.testing.assert_array_equal(again.contact_surfaces[2].vertices[0], [0.3, 0, 0.01])
     assert again.contact_surfaces[2].radius == RADIUS
@@ -167,7 +167,7 @@ def test_a_ball_that_is_a_link_rolls_as_one_that_is_a_body(tmp_path):
 
 
 def test_a_capsule_that_is_a_link_rolls_as_one_that_is_a_body(tmp_path):
-    """Down a slope, slantwise, off the origin of the link's frame and turned in it."""
+    """Obliquely down a slope; the capsule is displaced and rotated in the link's frame."""
     slope = Rotation.from_euler("y", 0.3)
     plane = dc.RigidBody.plane(4.0, pose=[0, 0, 0, *quaternion(slope)], friction=0.6)
     lies = slope * Rotation.from_euler("z", 0.4) * Rotation.from_euler("x", math.pi / 2)
@@ -183,7 +183,7 @@ def test_a_capsule_that_is_a_link_rolls_as_one_that_is_a_body(tmp_path):
     )
     across, along = float(body.inertia[0, 0]), float(body.inertia[2, 2])
     path = tmp_path / "pill.urdf"
-    # In the link's frame it lies along x.
+    # In the link's frame the capsule lies along x.
     path.write_text(
         f'<robot name="test"><link name="pill"><inertial><origin xyz="0.1 0 0"/>'
         f'<mass value="{body.mass!r}"/><inertia ixx="{along!r}" iyy="{across!r}" izz="{across!r}" '
@@ -220,7 +220,7 @@ def sheet(n=9, size=0.3, **keywords):
 
 
 def tip_pose(robot, q):
-    """Where a sphere in the frame of the tip is."""
+    """Pose of the tip's sphere at joint position `q`."""
     frame = robot.forward_kinematics(torch.tensor([q], dtype=F64))["finger"]
     turn = Rotation.from_matrix(frame[:3, :3].numpy())
     at = frame[:3, 3].numpy() + turn.apply([0.3, 0, 0.01])
@@ -237,7 +237,7 @@ def test_a_fingertip_presses_cloth_as_a_kinematic_ball_does(tmp_path, scheme):
     sim = dc.Simulator(dc.Scene([sheet()], robots=[robot]), 0.01, **options)
     twin = dc.Simulator(dc.Scene([sheet()], [ball]), 0.01, **options)
     ours, theirs = sim.initial_state(), twin.initial_state()
-    # The rod beside the sphere would touch cloth too: it stays above it.
+    # The rod beside the sphere could touch the cloth too; these angles keep the rod above.
     with torch.no_grad():
         for k in range(1, 13):
             angle = 0.015 * k
@@ -377,7 +377,7 @@ def test_gradients_are_central_differences(pressing, name):
     size = INPUTS.get(name, 1e-4)
     for d in directions(value.detach(), torch.Generator().manual_seed(5)):
         if name == "link_mass":
-            d[2:] = 0  # spheres that are links of their own have no mass
+            d[2:] = 0  # spheres that are separate links have no mass
         with torch.no_grad():
             error = mismatch(
                 lambda x: float(loss(step(x))), value.detach(), gradient, d, size, rtol=1e-5
@@ -403,7 +403,7 @@ def test_bits_are_those_of_a_batch(tmp_path):
 
 
 def test_a_loss_over_joint_angles_has_no_facets(tmp_path):
-    """Third differences over a sweep: triangles of the tip make them large."""
+    """Third differences over a sweep, which triangles of the tip increase."""
     rough = []
     for smooth in (True, False):
         robot = finger(
@@ -425,10 +425,10 @@ def test_a_loss_over_joint_angles_has_no_facets(tmp_path):
     assert rough[0] < 0.3 * rough[1], rough
 
 
-# --- What else knows surfaces ---------------------------------------------------------------------
+# --- Other users of surfaces ----------------------------------------------------------------------
 
 
-def test_it_is_drawn_and_exported_as_its_meshes(tmp_path):
+def test_a_smooth_link_is_drawn_and_exported_as_its_meshes(tmp_path):
     robot = finger(tmp_path, actuation="position")
     sim = dc.Simulator(dc.Scene([sheet(6)], robots=[robot]), 0.01)
     control = dc.Control(joint_positions=torch.tensor([0.1], dtype=F64))
@@ -447,7 +447,7 @@ def test_it_is_drawn_and_exported_as_its_meshes(tmp_path):
     torch.testing.assert_close(again.meshes()["arm/finger/1"][0], vertices)
 
 
-def test_something_can_be_attached_to_it(tmp_path):
+def test_an_attachment_to_a_smooth_link_holds(tmp_path):
     robot = finger(tmp_path, actuation="position")
     string = dc.Attachment(
         ("cloth0", 20), ("arm/finger/1", [0.3, 0.0, -0.08]), stiffness=50.0, rest_length=0.0
@@ -460,7 +460,7 @@ def test_something_can_be_attached_to_it(tmp_path):
     assert float(force) == pytest.approx(50 * float(length), rel=1e-6)
 
 
-def test_configurations_take_it(tmp_path):
+def test_configurations_accept_smooth_links(tmp_path):
     robot = finger(tmp_path)
     assert robot.name == "arm"
     config = tmp_path / "run.yaml"

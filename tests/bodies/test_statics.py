@@ -1,4 +1,4 @@
-"""Bodies at rest stay, stick and slide as they should, and weigh what they weigh."""
+"""Bodies at rest stay, stick and slide by the friction law, and contact carries their weight."""
 
 import math
 
@@ -26,7 +26,7 @@ def rolled(sim, seconds, state=None):
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_cube_and_a_stack_of_cubes_stay(count):
-    """5 s after they have come to rest on each other they are where they were."""
+    """Cubes that have come to rest on each other have not moved 5 s later."""
     gap = 7e-4
     cubes = [
         dc.RigidBody.box(
@@ -46,7 +46,7 @@ def test_a_cube_and_a_stack_of_cubes_stay(count):
     assert drift[..., :3].norm(dim=-1).max() < 1e-4
     assert 0.05 * drift[..., 3:].norm(dim=-1).max() < 1e-4
     wrenches = sim.contact_wrenches(rolled(sim, DT, rest)[-1])
-    for name in sim.surfaces[1:]:  # each carries those above it, and itself
+    for name in sim.surfaces[1:]:  # each wrench balances the cube's own weight
         assert wrenches[name][2] == pytest.approx(500 * 1e-3 * G, rel=1e-4)
     assert wrenches["floor"][2] == pytest.approx(-count * 500 * 1e-3 * G, rel=1e-4)
 
@@ -97,7 +97,7 @@ def test_a_box_dropped_into_a_pinned_cloth_settles_on_it():
     sim = dc.Simulator(dc.Scene([cloth], [box]), DT)
     state = rolled(sim, 4.0)[-1]
     assert state.body_velocities.abs().max() < 1e-3
-    assert state.body_poses[0, 2] < 0.05  # in the hollow that it has made
+    assert state.body_poses[0, 2] < 0.05  # in the hollow under the box
     force = sim.contact_wrenches(state)["body0"]
     weight = 0.2 * G
     assert force[2] == pytest.approx(weight, rel=1e-5)
@@ -106,7 +106,7 @@ def test_a_box_dropped_into_a_pinned_cloth_settles_on_it():
 
 
 def laid(pins, *bodies):
-    """Bodies on a level sheet of 11 x 11 that is pinned where `pins(x, y)` says so."""
+    """Bodies on a level sheet of 11 x 11 vertices, pinned where `pins(x, y)` is true."""
     cloth = dc.Cloth.grid(
         11,
         11,
@@ -146,21 +146,21 @@ WAYS_TO_PIN = {
 
 @pytest.mark.parametrize("pins", WAYS_TO_PIN)
 @pytest.mark.parametrize("shape", ["box", "capsule"])
-def test_pinned_cloth_bears_what_lies_on_it(shape, pins):
-    """Triangles whose corners are all pinned among them; also where the pins are moved up."""
+def test_pinned_cloth_bears_a_body(shape, pins):
+    """Some triangles have three pinned corners; the pins are also moved up."""
     sim = laid(WAYS_TO_PIN[pins], on_sheet(shape))
     state = sim.initial_state()
     with torch.no_grad():
         for _ in range(100):
             state = sim.step(state)
-            # What swings comes to rest.
+            # Damp the oscillation.
             state = state.replace(
                 velocities=0.7 * state.velocities, body_velocities=0.7 * state.body_velocities
             )
         assert state.report.contact_count > 0
         still = sim.step(state.replace(velocities=0 * state.velocities))
         weight = 0.2 * G
-        # Where a part is free it still swings a little, and the capsule rolls.
+        # A partly free sheet still oscillates slightly, and the capsule rolls.
         rel = (1e-6 if shape == "box" else 1e-3) if pins == "all over" else 1e-2
         assert still.body_forces[:, 2].sum() == pytest.approx(weight, rel=rel)
         height = still.body_poses[0, 2]
@@ -172,7 +172,7 @@ def test_pinned_cloth_bears_what_lies_on_it(shape, pins):
 
 
 def test_fingers_grip_cloth_that_is_pinned_all_over():
-    """As hard as their drives press, on both sides."""
+    """The contact force on both sides equals the drives' force."""
     sheet = dc.Cloth.grid(9, 9, size=(0.2, 0.2), name="sheet")
     cloth = dc.Cloth(sheet.vertices, sheet.faces, pins={"all": range(81)}, name="sheet")
     edge = cloth.vertices[:, 0].max()
@@ -199,8 +199,8 @@ def test_fingers_grip_cloth_that_is_pinned_all_over():
         assert abs(force) == pytest.approx(press.item(), rel=1e-4)
 
 
-def test_gradients_of_what_lies_on_pinned_cloth_are_those_of_differences():
-    """Of how it moves in two steps, by the pins that carry it, its mass and the thickness."""
+def test_gradients_of_a_body_on_pinned_cloth_are_those_of_differences():
+    """A loss on two steps, differentiated by the pins' targets, the body's mass and thickness."""
     sim = laid(lambda x, y: np.abs(x) < 0.25, on_sheet("box"))
     with torch.no_grad():
         start = sim.rollout(sim.initial_state(), steps=20)[-1]
@@ -244,7 +244,7 @@ def weightless(robot, *bodies):
     [
         ("slide", 1, 0.3, 0.5),
         ("slide", -1, -0.2, 0.5),
-        # The joint that follows it is at its own limit there: 0.5 turn + 0.1 = 1.
+        # The mimic joint is at its own limit there: 0.5 turn + 0.1 = 1.
         ("turn", 1, 1.8, 2.8),
         ("turn", -1, -1.0, 2.8),
     ],
@@ -257,7 +257,7 @@ def test_a_joint_driven_at_its_limit_stops_within_a_hundredth_of_its_range(
     arm = load_arm(tmp_path, actuation="torque", joint_positions={joint: near}, name="arm")
     sim = weightless(arm)
     given = sim.default_parameters()
-    # Something to damp what the limit throws back.
+    # Viscosity damps the rebound from the limit.
     given = given.replace(joint_viscosity=torch.full((3,), 1.0, dtype=F64))
     control = sim.control(joint_efforts={joint: side * effort})
     row = arm.joint_names.index(joint)
@@ -272,7 +272,7 @@ def test_a_joint_driven_at_its_limit_stops_within_a_hundredth_of_its_range(
 
 
 def driven_arm(folder):
-    """An arm whose drives give way to what pushes its tip."""
+    """An arm with compliant drives that yield to a push on its tip."""
     return load_arm(
         folder,
         stiffness={"slide": 300.0, "turn": 3.0, "spin": 2.0},
@@ -293,7 +293,7 @@ def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
 
     start = torch.tensor(robot.joint_positions)
     tip = points(start).numpy()
-    # A wall beside the tip that then moves into it by 1 cm.
+    # A wall beside the tip, which then moves 1 cm towards the tip.
     wall = dc.RigidBody.box(
         [0.1, 0.2, 0.2],
         motion="kinematic",
@@ -323,7 +323,7 @@ def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
 
 
 def test_a_wall_pushes_an_arm_that_is_alone_with_it(tmp_path):
-    """Without a cloth or a free body the barrier takes its default from the joints."""
+    """Without a cloth or a free body the barrier's default stiffness comes from the joints."""
     robot = driven_arm(tmp_path)
     (surface,) = (surface for surface in robot.surfaces if surface is not None)
     frame = robot.forward_kinematics(torch.tensor(robot.joint_positions))["d"].numpy()
@@ -344,6 +344,6 @@ def test_a_wall_pushes_an_arm_that_is_alone_with_it(tmp_path):
             state = sim.step(state, dc.Control(body_poses=poses))
     force = state.body_forces[sim.slices["arm/d"]].sum(0)
     assert force[0] < -0.1
-    # The drives hold against it.
+    # The drives resist the wall.
     assert state.joint_efforts.abs().max() > 0.01
     assert sim.initial_state().joint_positions[1] - state.joint_positions[1] > 0.01

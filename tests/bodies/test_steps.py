@@ -118,8 +118,8 @@ def test_velocities_of_bodies_on_poses_are_quotients(sim):
     torch.testing.assert_close(hand, expected)
 
 
-def test_they_are_where_nothing_but_cloths_moves_by_forces():
-    """The same quotients, and their gradients, in a scene without coordinates."""
+def test_velocities_of_bodies_on_poses_are_quotients_without_coordinates():
+    """Difference quotients and their gradients in a scene without generalized coordinates."""
     bodies = [
         dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 0, 1, 1, 0, 0, 0]),
         dc.RigidBody.plane(1.0, pose=[0, 0, -1, 1, 0, 0, 0]),
@@ -183,7 +183,7 @@ def test_links_move_as_their_poses_change(sim):
         poses = state.base_poses.clone()
         palm, twist = poses[1], state.base_velocities[1]
         turn = torch.linalg.matrix_exp(time * skew(twist[3:]))
-        # The base's velocity is that of the palm's center of mass.
+        # The base velocity is the velocity of the palm's center of mass.
         palm[:3] += centers[5] + time * twist[:3] - turn @ centers[5]
         palm[3:] = quaternion_of(turn)
         frames = sim.link_poses(state.replace(joint_positions=joints, base_poses=poses))
@@ -226,14 +226,14 @@ def test_contact_wrenches_carry_the_weight():
     weight = torch.tensor([0.0, 0.0, 0.5 * 9.81], dtype=F64)
     torch.testing.assert_close(wrenches["body1"][:3], weight, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(wrenches["floor"][:3], -weight, rtol=1e-4, atol=1e-4)
-    # Of the plane about its origin, of the box about its center.
+    # Torques are about the plane's origin and about the box's center.
     torque = torch.linalg.cross(state.body_poses[1, :3], -weight)
     torch.testing.assert_close(wrenches["floor"][3:], torque, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(wrenches["body1"][3:], torch.zeros(3, dtype=F64), atol=1e-4, rtol=0)
 
 
 def test_a_gripper_holds_a_sheet_with_its_efforts():
-    """Two fingers close on a hanging sheet with 2 N each: they stop at once, and do not rebound."""
+    """Two fingers close on a hanging sheet with 2 N each, stop at once and do not rebound."""
     pose = [0, 0.003, 0.09, np.cos(np.pi / 4), np.sin(np.pi / 4), 0, 0]
     sheet = dc.Cloth.grid(9, 9, 0.1, pose=pose, pins={"top": range(72, 81)})
     hand = dc.Robot.load(dc.robots.GRIPPER, actuation="torque", joint_positions=0.03, name="hand")
@@ -348,7 +348,7 @@ def test_a_failed_step_leaves_the_state_alone(sim):
     assert all(torch.equal(getattr(state, name), values) for name, values in kept.items())
 
 
-# --- What a simulator takes ----------------------------------------------------------------------
+# --- Inputs of a simulator -----------------------------------------------------------------------
 
 
 def box_scene(**options):
@@ -455,7 +455,7 @@ def test_gradients_of_two_steps_are_those_of_differences(sim, record, name):
     def loss(x):
         given = {**records, record: records[record].replace(**{name: x})}
         if record == "state" and name == "body_poses":
-            # A control must keep the rows of what is not kinematic.
+            # A control must keep the rows of bodies that are not kinematic.
             rows = torch.tensor([[0.0], [1.0], [0.0]], dtype=F64)
             kept = rows * control.body_poses + (1 - rows) * x
             given["control"] = control.replace(body_poses=kept)

@@ -1,4 +1,4 @@
-"""Configurations: what is read, what is refused, and how the message says so."""
+"""Configurations: accepted and refused values, and the error messages."""
 
 from __future__ import annotations
 
@@ -327,7 +327,7 @@ scene:
 """
 
 
-def test_what_moves_by_forces_is_built(write):
+def test_dynamic_bodies_and_robots_are_built(write):
     path = write(MOVING)
     task = load_task(path, [])
     scene = task.scene
@@ -435,7 +435,7 @@ def test_pairs_that_overlap_may_be_ignored_by_a_word(write):
         load_task(write(MOVING), ["scene.ignore_contact=touching"])
 
 
-# Those of `diffcloth train` have a schema of their own.
+# Configurations of `diffcloth train` have a separate schema.
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if not path.stem.startswith("train_")]
 
 

@@ -116,7 +116,7 @@ def test_a_simulated_sheet_hangs_from_its_pins(tmp_path):
 
 
 def test_a_controller_may_close_the_loop(tmp_path):
-    """It is asked before each step, with the state before that step."""
+    """The controller is called before each step, with the state before the step."""
     task = load_task(write_config(tmp_path, SHEET))
     asked = []
 

@@ -59,7 +59,7 @@ def on_a_lump(rng):
 
 
 def on_a_corner(rng):
-    """The corner of a box below the middle of the sheet, edges across it."""
+    """The corner of a box below the middle of the sheet, box edges across the sheet."""
     x, faces = box(0.5)
     turned = trimesh.geometry.align_vectors([-1, -1, 1], [0, 0, 1])[:3, :3]
     x = (x + np.array([0.25, 0.25, 0])) @ turned.T
@@ -101,7 +101,7 @@ def pinned(rng):
 
 
 def pinned_under_a_body(rng):
-    """The same sheet, a border of it pinned, under a box that moves."""
+    """The scene `on_a_corner` with a pinned border of the sheet, and a box that moves."""
     scene = on_a_corner(rng)
     scene.prescribed[:] = False
     scene.prescribed[6:24] = True
@@ -135,7 +135,7 @@ def lowered(body):
 
 
 def box_on_relief(rng):
-    """A box, finely cut, on terrain that stands still."""
+    """A finely meshed box on static terrain."""
     mesh = trimesh.creation.box((0.3, 0.25, 0.2)).subdivide()
     body = rotated((mesh.vertices, mesh.faces), rng)
     ground = relief(6, 0.9, rng, 0.03)
@@ -143,7 +143,7 @@ def box_on_relief(rng):
 
 
 def boxes_aslant(rng):
-    """Boxes whose edges in pieces are nearly parallel: mollified, also where pieces meet."""
+    """Boxes with nearly parallel, subdivided edges: mollified, also where pieces meet."""
     lower = trimesh.creation.box((0.4, 0.4, 0.2)).subdivide()
     upper = trimesh.creation.box((0.4, 0.4, 0.2)).subdivide()
     q = trimesh.transformations.euler_matrix(0.004, -0.006, 0.013)[:3, :3]
@@ -152,7 +152,7 @@ def boxes_aslant(rng):
 
 
 def ridges_across(rng):
-    """Ridges cut into pieces shorter than the reach, one above the other."""
+    """Two crossing ridges, each subdivided into pieces shorter than the reach."""
     pieces = [prism(7, rng), prism(5, rng)]
     q = trimesh.transformations.euler_matrix(np.pi, 0.05, 0.9)[:3, :3]
     above = raised((pieces[0][0] @ q.T, pieces[0][1]), 0.05)
@@ -193,7 +193,7 @@ def between_bodies(rng):
 
 
 def skeleton(*ends, radius, rng):
-    """A sphere or a capsule by its ends, turned about them at random; what it touches is round."""
+    """Skeleton of a smooth sphere or capsule with these ends, randomly rotated about them."""
     ends = np.array(ends, dtype=float)
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     carriers = ends[0] + radius * q[: 4 - len(ends)]
@@ -208,7 +208,7 @@ def on_a_round_ball(rng):
 
 
 def on_a_capsule(rng):
-    """A capsule that ends below the sheet: its side, its end, and what is between."""
+    """A capsule that ends below the sheet: contacts on its side, its end and in between."""
     capsule = skeleton([-0.6, 0.1, -0.24], [0.05, -0.03, -0.2], radius=0.2, rng=rng)
     scene = stack([cloth(6, 0.6, 0.03, rng, 0.01)], [capsule], body_dynamic=[True])
     scene.radius = [0.0, 0.2]
@@ -216,7 +216,7 @@ def on_a_capsule(rng):
 
 
 def on_a_short_capsule(rng):
-    """So short that edges see both ends; thick, and the sheet is pinned in part."""
+    """A thick capsule, so short that edges touch both ends, below a partly pinned sheet."""
     capsule = skeleton([-0.02, 0.03, -0.31], [0.05, 0.01, -0.3], radius=0.3, rng=rng)
     scene = stack([cloth(6, 0.6, 0.06, rng, 0.01)], [capsule])
     scene.radius, scene.thickness = [0.0, 0.3], [0.02, 0.03]

@@ -11,7 +11,7 @@ D_HAT = 1e-3
 
 
 def squared_distances(xi):
-    """Gaps from a hundredth of the activation distance to nearly all of it."""
+    """Squared distances for gaps from 0.01 to 0.95 of the activation distance."""
     return (xi + D_HAT * np.array([0.01, 0.1, 0.3, 0.5, 0.7, 0.95])) ** 2
 
 
@@ -57,7 +57,7 @@ def test_derivatives_match_finite_differences(xi, argument, of_value, of_slope):
 
 
 @pytest.mark.parametrize("xi", THICKNESSES)
-def test_it_vanishes_beyond_the_activation_distance(xi):
+def test_the_barrier_vanishes_beyond_the_activation_distance(xi):
     for distance in (1 + 1e-12, 1.5, 100.0):
         D = (xi + distance * D_HAT) ** 2
         assert kernels.barrier(D, xi, D_HAT) == 0
@@ -65,7 +65,7 @@ def test_it_vanishes_beyond_the_activation_distance(xi):
 
 
 @pytest.mark.parametrize("xi", THICKNESSES)
-def test_it_is_infinite_in_contact(xi):
+def test_the_barrier_is_infinite_in_contact(xi):
     for D in (xi**2, 0.5 * xi**2):
         assert kernels.barrier(D, xi, D_HAT) == np.inf
         assert kernels.barrier_derivatives(D, xi, D_HAT)[0] == np.inf

@@ -1,4 +1,4 @@
-"""Bodies against bodies: held apart everywhere, smoothly, whatever their triangles are."""
+"""Contact between bodies: smooth separation everywhere, for any triangulation."""
 
 import contact_scenes
 import ipctk
@@ -46,7 +46,7 @@ def wrench(scene):
     return np.array([*force.sum(axis=0), *torque]), len(potential.contacts(scene.x)[0])
 
 
-# --- What a body's corners and ridges stand for ---------------------------------------------------
+# --- Areas of a body's corners and ridges ---------------------------------------------------------
 
 
 def areas_of(body):
@@ -60,7 +60,7 @@ def areas_of(body):
 
 @pytest.mark.parametrize("cuts", range(4))
 def test_a_box_has_eight_corners_and_twelve_ridges(cuts):
-    """However it is cut: a quarter of three faces, and of two."""
+    """Corners have a quarter of three faces, ridges of two, for any subdivision."""
     size = np.array([0.4, 0.3, 0.2])
     x, faces = box(size, cuts)
     vertex, edge, surface = areas_of((x, faces))
@@ -99,7 +99,7 @@ def test_a_smooth_body_gives_its_vertices_their_surroundings():
 
 
 def test_hollows_stand_for_nothing():
-    """A step: the inner ridge and its ends cannot touch; what they leave goes to the corners."""
+    """On a step, the inner ridge and its ends cannot touch; the corners receive their area."""
     profile = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2.0]])
     caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     sides = [
@@ -164,7 +164,7 @@ def test_ridges_in_pieces_act_as_whole_ones():
     np.testing.assert_allclose(found, np.tile(found[0], (len(found), 1)), rtol=1e-9, atol=1e-11)
 
 
-# --- Nothing is held by collision detection alone ------------------------------------------------
+# --- Contact forces, not collision detection alone, keep bodies apart ----------------------------
 
 
 def hull(seed, size):
@@ -226,11 +226,11 @@ def test_bodies_push_each_other_apart(seed):
 @pytest.mark.parametrize("degrees", [0.0, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 45.0])
 @pytest.mark.parametrize("d_hat", [0.1, 0.01, 0.001])
 def test_equal_boxes_are_stacked_at_every_angle(degrees, d_hat):
-    """On corners where they are aligned, else where ridges cross; mollified in between."""
+    """Aligned boxes rest on corners, others on crossing ridges; mollified in between."""
     side = box((0.5, 0.5, 0.3))
     above = placed(side, turn(0, 0, np.radians(degrees)), (0, 0, d_hat / 2))
     force, _ = wrench(pair(above, below(side), d_hat=d_hat))
-    # What the boxes' faces would do: kappa A times the slope of the barrier at half of its reach.
+    # Force between the boxes' faces: kappa A times the barrier's slope at half of its reach.
     slope = -kernels.barrier_derivatives((d_hat / 2) ** 2, 0.0, d_hat)[1] * d_hat
     assert 0.9 < force[2] / (3.0 * 0.25 * slope) < 6
     np.testing.assert_allclose(force[[0, 1, 3, 4]], 0, atol=1e-9)
@@ -240,7 +240,7 @@ def test_equal_boxes_are_stacked_at_every_angle(degrees, d_hat):
 @pytest.mark.parametrize("name", ["stacked", "over-the-rim", "lumps", "on-relief"])
 @pytest.mark.parametrize("seed", range(3))
 def test_force_and_torque_are_continuous_along_rigid_motions(name, seed):
-    """Over faces, ridges, corners and where ridges become parallel: jumps shrink with the step."""
+    """Across faces, ridges, corners and parallel ridges, changes shrink with the step."""
     rng = np.random.default_rng(seed)
     if name == "lumps":
         above, under = contact_scenes.ball(rng, 0.3, 0.1), contact_scenes.ball(rng, 0.25, 0.1)
@@ -281,7 +281,7 @@ def test_a_sliding_box_is_held_back_by_mu_times_its_normal_force(name, cuts):
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-13)
 
 
-# --- What must not be tested, and what must not be missed ----------------------------------------
+# --- Excluded pairs, and pairs that must not be missed -------------------------------------------
 
 
 def resting(**values):
@@ -311,7 +311,7 @@ def test_a_body_may_ignore_a_cloth():
 
 
 def test_pairs_of_prescribed_vertices_carry_no_energy():
-    """Also where the pairs of surfaces say that they may touch."""
+    """This holds also if their pair of surfaces may touch."""
     above = placed(box((0.3, 0.3, 0.3)), turn(0, 0, 0.3), (0, 0, 0.4 * D_HAT))
     scene = stack([], [above, FLOORS["two"]], body_dynamic=[True, False])
     scene.prescribed[:] = True
@@ -321,7 +321,7 @@ def test_pairs_of_prescribed_vertices_carry_no_energy():
 
 @pytest.mark.parametrize("seed", range(12))
 def test_no_collision_of_bodies_is_missed(seed):
-    """Three bodies thrown at each other; ipctk judges the motion and what is certified of it."""
+    """Three bodies thrown at each other; ipctk judges the motion and its certified part."""
     rng = np.random.default_rng(seed)
     at = 0.8 * np.array([[1.0, 0, 0], [-0.5, 0.87, 0], [-0.5, -0.87, 0]])
     hulls = [hull(3 * seed + k, 0.8) for k in range(3)]

@@ -60,7 +60,7 @@ def crowd(seed=0):
     return merged([grid(7, rng, 0.42), *bodies, plane(10.0, -0.01)])
 
 
-# Of the crowd: the plane stands still, and two bodies ignore each other; so do cloth and block.
+# Options of the crowd: the plane is static; two bodies ignore each other, as do cloth and block.
 CROWD = {"body_dynamic": [True, True, False, False], "ignored_pairs": [[1, 2], [0, 3]]}
 
 
@@ -70,7 +70,7 @@ def boxes(x_t0, x_t1, elements):
 
 
 def frame_of(a, b, x_t0, x_t1, surface, cloth_count, reach):
-    """Motion of the frame that a pair of surfaces meets in: of the body, or of the first cloth."""
+    """Motion of a surface pair's common frame: mean motion of its body, or of its first cloth."""
     of = max(a, b) if max(a, b) >= cloth_count else min(a, b)
     motion = (x_t1 - x_t0)[surface == of].mean(axis=0)
     return motion if np.abs(motion).max() > reach[of] else np.zeros(3)
@@ -180,8 +180,8 @@ def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
 
 
 @pytest.mark.parametrize("away", [0.0, 1e6], ids=["near the origin", "far away"])
-def test_at_rest_what_is_within_reach_is_a_candidate(away):
-    """Of those by their boxes all that are as close, and less than half of the others."""
+def test_elements_within_reach_at_rest_are_candidates(away):
+    """All candidates within reach are found, and less than half of the others found by boxes."""
     x, faces, surface = scene()
     mesh = kernels.BroadPhase(faces, surface, 2, True, x)
     at = x + away + 0.003 * np.random.default_rng(12).normal(size=x.shape)
@@ -205,7 +205,7 @@ def test_at_rest_what_is_within_reach_is_a_candidate(away):
 
 
 def test_a_reach_is_that_of_its_surface():
-    """What is thick does not bring other surfaces together."""
+    """A thick surface adds no candidates between other surfaces."""
     x, faces, surface = scene()
     mesh = kernels.BroadPhase(faces, surface, 2, True, x)
     thin = mesh.find(x, x, [0.01, 0.01, 0.01, 0.01])
@@ -228,7 +228,7 @@ def test_flying_together_is_like_standing_still():
     x_t1 = x + 0.01 * rng.normal(size=x.shape)
     still = mesh.find(x, x_t1, 0.02)
     flying = mesh.find(x, x_t1 + np.array([60.0, -30.0, 15.0]), 0.02)
-    # Not the same to the pair: the rest is seen from the first cloth's mean motion.
+    # The candidates differ slightly: motion is relative to the first cloth's mean motion.
     assert 0.9 < len(flying) / len(still) < 1.1
     kinds = np.bincount(flying[:, 0])
     assert (kinds > 100).all()
@@ -317,7 +317,7 @@ def test_intersections_of_random_cloths_agree_with_ipctk():
 
 
 def pierces(x, edge, face):
-    """Whether an edge crosses a triangle, in general position."""
+    """Return whether an edge crosses a triangle, in general position."""
     a, b = x[edge]
     t0, t1, t2 = x[face]
 
@@ -355,7 +355,7 @@ def test_the_lowest_intersection_is_that_of_brute_force(self_contact):
 
 
 def test_intersections_of_bodies_are_found():
-    """Of those that meet, and of no others."""
+    """Intersections are found for bodies that intersect, and for no others."""
     x, faces, surface = crowd()
     mesh = kernels.BroadPhase(faces, surface, 1, True, x, **CROWD)
     assert mesh.find_intersection(x) is None
@@ -394,7 +394,7 @@ def test_an_edge_that_pierces_ever_so_little_is_found(depth):
     spike = np.array([[0.3, 0.3, -depth], [0.3, 0.3, 1], [0.4, 0.3, 1]]), np.array([[0, 1, 2]])
     x, faces, surface = merged([cloth, spike])
     x = np.ascontiguousarray(x @ q)
-    # Rounding of the rotated corners is 1e-16: at a depth of 1e-15 it cannot hide the tip.
+    # Rounding of the rotated corners, 1e-16, cannot hide a tip at a depth of 1e-15.
     assert kernels.BroadPhase(faces, surface, 2, True, x).find_intersection(x) is not None
     x = np.ascontiguousarray(x + 2 * depth * q[2] * (surface == 1)[:, None])
     assert kernels.BroadPhase(faces, surface, 2, True, x).find_intersection(x) is None
@@ -402,7 +402,7 @@ def test_an_edge_that_pierces_ever_so_little_is_found(depth):
 
 @pytest.mark.parametrize(("height", "expected"), [(-(2.0**-54), True), (2.0**-53, False)])
 def test_a_tip_next_to_a_face_is_judged_exactly(height, expected):
-    """One unit in the last place above a tilted plane or below, where coordinates are exact."""
+    """A tip one unit in the last place above or below a tilted plane, with exact coordinates."""
     cloth = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, 1]]), np.array([[0, 1, 2]])
     tip = np.array([[0.25, 0.25, 0.5 + height], [0.25, 0.25, 1.5], [0.5, 0.25, 2.5]])
     x, faces, surface = merged([cloth, (tip, np.array([[0, 1, 2]]))])
@@ -459,7 +459,7 @@ def test_the_smallest_distance_is_that_of_brute_force():
 
 
 def test_the_smallest_distance_may_lie_beyond_pairs_whose_boxes_overlap():
-    """Two large triangles, aslant and 5.7 apart, come up before two small ones that are closer."""
+    """The search visits two large oblique triangles, 5.7 apart, before two closer small ones."""
     large = np.array([[0.0, 0, 0], [10, 10, 0], [10, 10, 0.1]])
     small = np.array([[100.0, 0, 0], [100.5, 0, 0], [100, 0.5, 0]])
     x = np.concatenate([large, large + np.array([4, -4, 0]), small, small + np.array([3, 0, 0])])
@@ -477,7 +477,7 @@ def test_a_single_triangle_has_no_elements_apart():
 
 @pytest.mark.parametrize("level", kernels.kernel_levels())
 def test_near_boxes(level):
-    """Boxes with margins that sum up to the range: within it without them, as the crow flies."""
+    """Boxes with margins that sum to the range; inner boxes are near by Euclidean distance."""
     rng = np.random.default_rng(5)
     found = 0
     for _ in range(200):
@@ -510,7 +510,7 @@ def round_scene(name, seed=0):
 
 
 def pairs_within(drawn, mesh, x_t0, x_t1, reach, samples=40):
-    """(edge-edge, a, b) that come within reach on a sampled motion; ends of skeletons meet all."""
+    """Pairs (edge-edge, a, b) within reach on a sampled motion; skeleton ends meet all elements."""
     surface, is_round = drawn.surface, np.array(drawn.radius) > 0
     used = np.unique(drawn.faces)
     points = [

@@ -9,7 +9,7 @@ REACH = [0.01, 0.02, 0.015, 0.005]
 
 
 def close_pairs(everything, x_t0, x_t1, surface, reach_of=REACH):
-    """Pairs within reach at some time of the motion, at least at these."""
+    """Pairs within reach at one of five sampled times of the motion."""
     found = set()
     for share in np.linspace(0, 1, 5):
         at = x_t0 + share * (x_t1 - x_t0)
@@ -34,14 +34,14 @@ def search():
 @pytest.mark.parametrize("common", [0.0, 5.0], ids=["still", "flying"])
 @pytest.mark.parametrize("scale", [1e-5, 1e-3, 1e-2, 1e-1])
 def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
-    """Over a walk of many motions, from lists made before it."""
+    """A random walk of many motions reuses lists made earlier."""
     x, mesh, surface, everything = search
     rng = np.random.default_rng(int(1e6 * scale))
     cloths = (surface < 2)[:, None]
     at, builds = x + 0.003 * rng.normal(size=x.shape), mesh.builds
     missed, close_count, found_count, swept_count = 0, 0, 0, 0
     for _ in range(6):
-        # A body moves as one; the cloths also share a motion, which brings them to the bodies.
+        # A body moves rigidly; the cloths also share a motion, which moves them to the bodies.
         step = scale * rng.normal(size=x.shape) * cloths
         step += scale * rng.normal(size=3) * (surface == 2)[:, None]
         step += common * scale * rng.normal(size=3) * cloths
@@ -64,7 +64,7 @@ def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
 @pytest.mark.parametrize("common", [0.0, 5.0], ids=["still", "flying"])
 @pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 1e-1])
 def test_pairs_stay_as_far_apart_as_they_say(search, scale, common):
-    """From lists of any age; ipctk measures how near each pair comes."""
+    """This holds for lists of any age; ipctk computes the smallest distance of each pair."""
     x, mesh, surface, _ = search
     rng = np.random.default_rng(int(1e6 * scale))
     cloths = (surface < 2)[:, None]
@@ -78,14 +78,14 @@ def test_pairs_stay_as_far_apart_as_they_say(search, scale, common):
             d_sq = [measure(*(at + t * step)[pair[1:5]]) for t in np.linspace(0, 1, 17)]
             # Distances of coordinates around 1 round by 1e-15.
             assert min(d_sq) ** 0.5 >= least - 1e-14
-            # No bound is slack by more than what two corners have moved since the list was made.
+            # No bound is slack by more than the motion of two corners since the list was made.
             assert min(d_sq) ** 0.5 - least < 60 * scale * (1 + common)
             checked += least > 0
         at = at + step
     assert checked > 20 or scale > 1e-3
 
 
-def test_what_moves_alone_brings_its_own_pairs_alone(search):
+def test_a_single_moving_vertex_adds_only_its_own_pairs(search):
     """A surface counts as near as its fastest part, but its other pairs do not."""
     x, mesh, surface, _ = search
     mover = 0
@@ -114,8 +114,8 @@ def test_no_pair_of_bodies_is_missed(scale):
     assert close_count > 100
 
 
-def test_what_meets_nothing_costs_no_list():
-    """However far it flies; what flies through everything else does cost one."""
+def test_a_motion_without_contact_costs_no_list():
+    """A motion of any length without contact needs no list; a motion through others needs one."""
     x, faces, surface = crowd()
     mesh = kernels.BroadPhase(faces, surface, 1, True, x, ignored_pairs=[[0, 3]])
     mesh.find_kept(x, x, [0.01] * 5)
@@ -129,8 +129,8 @@ def test_what_meets_nothing_costs_no_list():
     assert mesh.builds == 2
 
 
-def test_what_flies_side_by_side_brings_few_pairs():
-    """Of all within a curtain that swings as a door does, none come nearer than they were."""
+def test_parts_that_fly_side_by_side_add_few_pairs():
+    """A curtain swings as a door does: no pair within the curtain comes closer."""
     x, faces, surface = merged([grid(12, np.random.default_rng(2))])
     mesh = kernels.BroadPhase(faces, surface, 1, True, x)
     start = {tuple(c) for c in mesh.find_kept(x, x, [0.01])}
@@ -140,7 +140,7 @@ def test_what_flies_side_by_side_brings_few_pairs():
     assert len(found) < 0.2 * len(mesh.find(x, x + turn, [0.01]))
 
 
-def test_what_is_found_is_sorted(search):
+def test_candidates_are_sorted(search):
     x, mesh, _, _ = search
     step = 1e-3 * np.random.default_rng(1).normal(size=x.shape)
     kept = mesh.find_kept(x, x + step, REACH)
@@ -170,7 +170,7 @@ def test_another_reach_makes_another_list(search):
         assert close <= {tuple(c) for c in found}
 
 
-def test_what_is_near_a_point_does_not_depend_on_the_list(search):
+def test_pairs_near_a_point_do_not_depend_on_the_list(search):
     x, _, surface, everything = search
     _, faces, _ = scene()
     at = x + 0.003 * np.random.default_rng(2).normal(size=x.shape)
@@ -193,7 +193,7 @@ def test_what_is_near_a_point_does_not_depend_on_the_list(search):
 
 
 def test_motions_that_are_not_finite_are_searched_as_such(search):
-    """A solver may try them; they must not be answered from a list."""
+    """A solver may try such motions; a kept list must not answer the search."""
     x, mesh, _, _ = search
     mesh.find_kept(x, x, REACH)
     for value in (np.nan, np.inf):

@@ -35,7 +35,7 @@ def test_no_exact_collision_is_missed(edge_edge):
 
 
 def meeting_motions(edge_edge, count, rng, gap=None):
-    """Random motions in which a point of either primitive meet at a known time.
+    """Random motions in which one point of each primitive meet at a known time.
 
     With `gap` [Q], random points of the primitives are that far apart at the start.
     """
@@ -76,7 +76,7 @@ def test_motions_that_meet_are_stopped_before_they_do(edge_edge, xi):
 
 @pytest.mark.parametrize("edge_edge", KINDS)
 def test_motions_that_meet_after_a_near_miss_are_stopped_before_they_do(edge_edge):
-    """Gaps down to the rounding of the positions, where the direction of the gap is uncertain."""
+    """Gaps down to the rounding of positions, at which the gap's direction is uncertain."""
     rng = np.random.default_rng(10)
     gap = 10 ** rng.uniform(-11, -3, size=5000)
     x_t0, x_t1, meeting = meeting_motions(edge_edge, 5000, rng, gap)
@@ -101,7 +101,7 @@ def test_motions_that_clear_each_other_are_not_stopped(edge_edge):
 @pytest.mark.parametrize("xi", [0.0, 0.02])
 @pytest.mark.parametrize("edge_edge", KINDS)
 def test_motions_are_stopped_where_a_tenth_of_the_gap_is_left(edge_edge, xi, d_hat):
-    """Not where a search happens to end, which jumps when a motion changes in its last bits."""
+    """The end of an iterative search would jump with the last bits of a motion."""
     x_t0, x_t1, _ = meeting_motions(edge_edge, 3000, np.random.default_rng(7))
     t = kernels.safe_step(edge_edge, x_t0, x_t1, xi, d_hat)
     x = x_t0 + t[:, None, None] * (x_t1 - x_t0)
@@ -111,7 +111,7 @@ def test_motions_are_stopped_where_a_tenth_of_the_gap_is_left(edge_edge, xi, d_h
     np.testing.assert_allclose(left[apart], 0.1 * np.minimum(gap, d_hat)[apart], rtol=1e-3)
     until = (1 - 1e-6) * t[apart]
     closest = smallest_distance(edge_edge, x_t0[apart], x_t1[apart], until)
-    assert (closest - xi > (1 - 1e-3) * left[apart]).all()  # there for the first time
+    assert (closest - xi > (1 - 1e-3) * left[apart]).all()  # first time at this gap
 
 
 def one(edge_edge, x_t0, x_t1, xi=0.0):
@@ -167,8 +167,8 @@ def test_motions_that_are_not_numbers_are_not_certified(broken):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 1e3], ids=["thin", "thick", "far"])
-def test_what_stays_beyond_the_harmless_distance_is_never_the_first(share):
-    """And what ends a little nearer is: a point that moves to a triangle, and crossing edges."""
+def test_a_pair_beyond_the_harmless_distance_is_never_the_first(share):
+    """A pair that ends slightly nearer is the first: point and triangle, and crossing edges."""
     d_hat, xi = 1e-3, 1e-3 * min(share, 1.0)
     offset = np.array([0.3, 0.3, 0.4]) * (1.0 if share < 2 else share)
     corners = {

@@ -1,4 +1,4 @@
-"""Derivatives of contacts along several directions: each has the bits that it has alone."""
+"""Derivatives of contacts along several directions have the bits of single directions."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from diffcloth_torch import _kernels as kernels
 
 
 def test_neither_company_nor_instructions_change_a_bit():
-    """The arithmetic is tested through potentials; here it is that of every level and lane."""
+    """Every instruction level and lane agrees; tests of potentials check the values."""
     expected = kernels.directions(kernels.kernel_levels()[0], alone=True)
     assert np.isfinite(expected).all()
     assert len({row.tobytes() for row in np.moveaxis(expected, -1, 0)}) == 8

@@ -44,7 +44,7 @@ def exact_point_segment(p, a, b):
 
 
 def exact_interior(w, e0, e1):
-    """|w - b0 e0 - b1 e1|^2 at its minimum, with b0, b1; None where e0 and e1 are parallel."""
+    """Minimum of |w - b0 e0 - b1 e1|^2, with b0, b1; None if e0 and e1 are parallel."""
     a, b, c = dot(e0, e0), dot(e0, e1), dot(e1, e1)
     det = a * c - b * b
     if det == 0:
@@ -87,7 +87,7 @@ def all_regions(edge_edge):
     """Pairs in every region and on the borders between them."""
     for s, t, height in itertools.product(OFFSETS, OFFSETS, (0.0, 1e-6, 0.7)):
         if edge_edge:
-            # Edge a along x, from where its line passes b's at parameters (s, t).
+            # Edge a along x; its line passes the line of b at parameters (s, t).
             b = np.array([[0.0, -t, height], [0.0, 1 - t, height]])
             yield np.vstack([[[-s, 0.0, 0.0], [1 - s, 0.0, 0.0]], b])
         else:
@@ -132,7 +132,8 @@ def scale_sq(x):
 def test_distances_are_those_of_exact_arithmetic(edge_edge, pairs):
     for x in pairs(edge_edge):
         exact = exact_distance_sq(edge_edge, x)
-        # Rounding of a distance is 1e-15 of the size L: of its square, L 1e-15 (2 d + L 1e-15).
+        # Rounding of a distance d is 1e-15 L with the size L, hence of its square
+        # L 1e-15 (2 d + L 1e-15).
         size_sq = scale_sq(x)
         tolerance = 1e-14 * np.sqrt(size_sq * exact) + 1e-28 * size_sq
         (robust,) = kernels.distance_sq(edge_edge, x[None])
@@ -153,7 +154,7 @@ def test_distances_of_many_pairs_are_those_of_each(edge_edge, pairs):
     assert np.all(np.abs(many[0] - alone) <= 1e-14 * np.sqrt(size_sq * alone) + 1e-28 * size_sq)
     for level, distances in zip(levels, many, strict=True):
         assert distances.tobytes() == many[0].tobytes(), level
-        # Whatever pairs are beside it, and where there are none.
+        # The bits are independent of neighboring pairs, and of their absence.
         shifted = kernels.distances_sq(level, edge_edge, x[3:])
         assert shifted.tobytes() == distances[3:].tobytes(), level
         one = kernels.distances_sq(level, edge_edge, x[-1:])

@@ -1,4 +1,4 @@
-"""Contact with a body does not know how the body is cut into triangles."""
+"""Contact with a body does not depend on the body's triangulation."""
 
 import contact_scenes
 import numpy as np
@@ -10,7 +10,7 @@ D_HAT = 0.1
 
 
 def grid_floor(columns, rows, size, sliver=None):
-    """Flat floor of 2 * columns * rows triangles; a sliver makes columns that narrow."""
+    """Flat floor of 2 * columns * rows triangles; `sliver` is the width of extra columns."""
     x = np.linspace(-0.5, 0.5, columns + 1)
     if sliver:
         x = np.sort([*x, *(x[1:-1] + sliver)])
@@ -43,7 +43,7 @@ def rotation(seed):
 @pytest.mark.parametrize("aligned", [False, True], ids=["jittered", "aligned"])
 @pytest.mark.parametrize("name", list(FLOORS))
 def test_a_flat_floor_is_seen_once(name, aligned, turned):
-    """By every vertex, with all of its area, also right above edges and vertices."""
+    """Every vertex has contact with its whole area, also right above edges and vertices."""
     rng = np.random.default_rng(0)
     X, faces = contact_scenes.grid(9, 1.0, rng, 0.0 if aligned else 0.3)
     q = rotation(1) if turned else np.eye(3)
@@ -113,7 +113,7 @@ def prism(pieces, angle=90.0, length=1.0):
 
 @pytest.mark.parametrize("turn", [0.3, 0.7])
 def test_a_ridge_in_pieces_is_one_ridge(turn):
-    """A sheet across it feels the same barrier, whatever the pieces."""
+    """The barrier on a sheet across the ridge is the same for any subdivision."""
     X, faces = contact_scenes.grid(12, 0.8, np.random.default_rng(4))
     q = trimesh.transformations.rotation_matrix(turn, [0, 0, 1])[:3, :3]
     x = X @ q.T + [0.013, 0.007, 0.5 * D_HAT]
@@ -122,12 +122,12 @@ def test_a_ridge_in_pieces_is_one_ridge(turn):
         scene = stack([(X, x, faces)], [prism(pieces, length=3.0)], self_contact=False)
         potential = scene.potential()
         found.append(potential.energies(scene.x, scene.x)[0].sum())
-    # Not exact: an edge that ends beside the ridge sees the piece that it leans towards.
+    # Approximate: an edge that ends beside the ridge is in contact with the piece on its side.
     assert max(found) / min(found) < 1.02
 
 
 def along_a_path(body, x, direction, length, steps, up=(0.0, 0.0, 1.0)):
-    """Gradients by one vertex, whose face stands far above, along a straight path."""
+    """Gradients by one vertex along a straight path; the rest of its face is far above."""
     X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2]])
     found = []
@@ -197,7 +197,7 @@ def groove(angle):
 
 @pytest.mark.parametrize(("angle", "least"), [(150, 0.92), (120, 0.73), (90, 0.48), (45, 0.12)])
 def test_the_walls_of_a_groove_push_out(angle, least):
-    """What is left of the nearest wall's push along its normal; the walls push at each other."""
+    """Share of the nearest wall's normal force that remains; the walls' forces oppose."""
     half = np.radians(angle) / 2
     along, normal = np.array([[0, np.sin(half), np.cos(half)], [0, -np.cos(half), np.sin(half)]])
     shares = []
@@ -210,7 +210,7 @@ def test_the_walls_of_a_groove_push_out(angle, least):
     assert least <= min(shares) < least + 0.02
 
 
-# --- What is sharp -------------------------------------------------------------------------------
+# --- Sharp edges and vertices --------------------------------------------------------------------
 
 
 def weights_of(body, cloth_edge=0.05):
@@ -238,7 +238,7 @@ def test_a_box_is_sharp_at_its_edges_and_corners():
 
 
 def test_inward_faces_are_taken_for_bulging():
-    """A room, or a body inside out: whatever it is, no edge of it may go unseen."""
+    """A room, or a body with inverted faces: no edge may be ignored in either case."""
     x, faces = contact_scenes.box(1.0)
     edge, vertex, _ = weights_of((x, faces[:, ::-1]))
     assert sorted(edge.values()) == [0.0] * 6 + [1.0] * 12
@@ -252,7 +252,7 @@ def test_a_hollow_edge_is_not_sharp():
     edge, _, _ = weights_of((x, faces))
     assert edge[(0, 5)] == 0.0
     assert edge[(1, 6)] == 1.0
-    # Open, it may be touched from below.
+    # The open groove may be touched from below.
     walls = np.array([f for f in faces if len(set(f) & {0, 1, 5, 6}) == 3])
     other = np.array([f for f in faces if len(set(f) & {0, 4, 5, 9}) == 3])
     assert weights_of((x, np.concatenate([walls, other])))[0][(0, 5)] == 1.0
@@ -312,7 +312,7 @@ def test_a_star_is_sharp_at_its_tips_only():
     assert edge[(0, 12)] > 0 == edge[(1, 12)]
 
 
-def test_pinned_faces_of_a_cloth_bear_what_moves_alone():
+def test_pinned_faces_of_a_cloth_bear_only_moving_points():
     scene = contact_scenes.make("pinned")
     _, _, counts = scene.potential().feature_weights(prescribed_point=True)
     expected = [not scene.prescribed[f].all() or scene.surface[f[0]] > 0 for f in scene.faces]
@@ -323,7 +323,7 @@ def test_pinned_faces_of_a_cloth_bear_what_moves_alone():
 
 
 def test_a_thick_body_costs_what_a_thin_one_does():
-    """The same sheet at the same gap: as many candidates and contacts, within the cloth too."""
+    """One sheet at one gap has the same number of candidates and contacts, also in the cloth."""
     rng = np.random.default_rng(6)
     X, faces = contact_scenes.grid(20, 1.0, rng)
     found = []

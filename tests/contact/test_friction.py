@@ -42,7 +42,7 @@ def test_derivatives_match_finite_differences(y):
 
 def test_branches_meet_at_the_threshold():
     below, above = kernels.friction_law(E * (1 - 1e-12), E), kernels.friction_law(E, E)
-    size = np.array([E, 1 / E, 1 / E**3, 1 / E**2, 1])  # what the entries are made of
+    size = np.array([E, 1 / E, 1 / E**3, 1 / E**2, 1])  # scales of the entries
     np.testing.assert_allclose(below / size, above / size, atol=1e-11)
 
 

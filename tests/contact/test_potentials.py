@@ -34,7 +34,7 @@ def directions(shape, count=4, seed=3):
 @pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 0.1])
 @pytest.mark.parametrize("name", ["on_relief", "on_a_ball", "crumpled"])
 def test_the_safe_fraction_is_the_least_of_all_pairs(name, scale):
-    """On a walk, whose pairs are kept: those that are left out as harmless are."""
+    """A random walk with kept pairs: pairs that are omitted as harmless do not limit the step."""
     scene = contact_scenes.make(name)
     potential = scene.potential()
     mesh = kernels.BroadPhase(
@@ -50,7 +50,7 @@ def test_the_safe_fraction_is_the_least_of_all_pairs(name, scale):
             corners = pairs[pairs[:, 0] == kind, 1:5]
             steps += list(kernels.safe_step(bool(kind), at[corners], to[corners], 0.0, scene.d_hat))
         fractions.append(potential.safe_fraction(at, to))
-        # A search ends where it goes on by less than 1e-12 of the time.
+        # A search ends when its advance is less than 1e-12 of the time.
         assert fractions[-1] == pytest.approx(min(steps), rel=1e-11)
         at = at + 0.9 * fractions[-1] * (to - at)
     assert (min(fractions) < 1) == (scale > 1e-3)
@@ -143,7 +143,7 @@ def test_the_projected_hessian_is_positive(name):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_projected_hessian_is_no_smaller_than_the_exact_one(seed):
-    """Between nearly parallel edges, too, where most of the curvature is the mollifier's."""
+    """This includes nearly parallel edges, whose curvature is mostly due to the mollifier."""
     scene = contact_scenes.make("two_cloths", seed)
     potential = scene.potential()
     positive = potential.hessian(scene.x, positive=True)
@@ -169,7 +169,7 @@ def with_measure(scene, name, values, **changes):
 
 
 def check_parameters(scene, found, value):
-    """found: cotangents; value(potential): what they are the derivatives of."""
+    """Compare the cotangents `found` with difference quotients of `value(potential)`."""
     if not scene.thickness:
         scene.thickness = parameter_of(scene, "thickness").tolist()
     scale = max(np.abs(v).max(initial=0) for k, v in found.items() if k != "x_lag")
@@ -309,7 +309,7 @@ def test_friction_has_the_derivatives_of_its_energy(name, amount):
 @pytest.mark.parametrize("amount", [0.003, 0.05])
 @pytest.mark.parametrize("name", NAMES)
 def test_mixed_derivatives_of_friction(name, amount, angle):
-    """The frames of gaps turn, up to where a gap at the start is not made as long as at the lag."""
+    """Frames of gaps rotate, also by angles at which start gaps are not scaled to lagged ones."""
     scene = contact_scenes.make(name)
     if not scene.thickness:
         scene.thickness = parameter_of(scene, "thickness").tolist()
@@ -342,7 +342,7 @@ def random_tangents(found, seed=9):
 
 
 def pairing(found, dot):
-    """Of cotangents and tangents: the sum, and that of its sizes."""
+    """Pairing of cotangents and tangents, and the sum of the absolute values of its terms."""
     terms = [np.dot(np.ravel(bar), np.ravel(dot[name])) for name, bar in found.items()]
     return sum(terms), sum(abs(term) for term in terms)
 
@@ -364,7 +364,7 @@ def test_tangents_are_mixed_derivatives_transposed(name):
 @pytest.mark.parametrize("amount", [0.003, 0.05])
 @pytest.mark.parametrize("name", NAMES)
 def test_tangents_of_friction_are_mixed_derivatives_transposed(name, amount, angle):
-    """The frames of gaps turn, up to where a gap at the start is not made as long as at the lag."""
+    """Frames of gaps rotate, also by angles at which start gaps are not scaled to lagged ones."""
     scene = contact_scenes.make(name)
     start, x = moved(scene, amount) @ rotation(angle, 3).T, moved(scene, amount, 6)
     for z in directions(scene.x.shape, 2, seed=8):
@@ -379,7 +379,7 @@ def test_tangents_of_friction_are_mixed_derivatives_transposed(name, amount, ang
 
 
 def test_contacts_that_are_expected_to_slide_are_as_soft_as_there():
-    """At rest the curvature is that of sticking, thousands of times as much."""
+    """At rest the curvature is the sticking curvature, which is thousands of times larger."""
     scene = contact_scenes.make("two_cloths")
     potential = scene.potential(slip=1e-6)
     slide = np.zeros_like(scene.x)
@@ -394,7 +394,7 @@ def test_contacts_that_are_expected_to_slide_are_as_soft_as_there():
     np.testing.assert_array_equal(h, positive)
     assert along @ at_rest @ along > 1e3 * (along @ h @ along)
     np.testing.assert_array_equal(friction.hessian(scene.x), at_rest)  # the exact one stays
-    # A step ends it.
+    # A step ends the expectation.
     friction.after(scene.x, slide)
     np.testing.assert_array_equal(friction.hessian(scene.x, True), at_rest)
 
@@ -413,12 +413,12 @@ def test_nothing_is_expected_where_all_sticks():
 
 @pytest.mark.parametrize("name", ["pinned_under_a_body", "on_a_capsule", "boxes_aslant"])
 def test_nothing_is_expected_of_bodies_that_forces_move(name):
-    """What they hold often sticks, wherever inertia alone would take it."""
+    """Objects held by such bodies often stick, even if inertia alone would move them."""
     scene = contact_scenes.make(name)
     friction = scene.potential(slip=1e-6).friction(scene.x, scene.x)
     slide = np.zeros_like(scene.x)
     slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
-    assert np.abs(friction.gradient(scene.x + slide)).max() > 1e-4  # it would slide
+    assert np.abs(friction.gradient(scene.x + slide)).max() > 1e-4  # the contact would slide
     exact = friction.hessian(scene.x)
     expects, h, _ = friction.expecting(scene.x, scene.x + slide)
     assert not expects
@@ -427,9 +427,9 @@ def test_nothing_is_expected_of_bodies_that_forces_move(name):
 
 @pytest.mark.parametrize("name", ["two_cloths", "on_a_lump", "on_relief"])
 def test_duals_remember_the_other_side_of_a_kink(name):
-    """A slip that turns round: no curvature along it, but twice the majorant's with duals.
+    """A slip that reverses: no exact curvature, but twice the majorant's curvature with duals.
 
-    The majorant is without contacts whose weight is negative, from which duals would take.
+    The majorant omits contacts of negative weight, whose duals would reduce the curvature.
     """
     scene = contact_scenes.make(name)
     potential = scene.potential(slip=1e-6)
@@ -446,7 +446,7 @@ def test_duals_remember_the_other_side_of_a_kink(name):
     assert has_duals
     assert abs(along @ exact @ along) < 1e-9 * most
     assert along @ h @ along == pytest.approx(2 * most, rel=1e-6)
-    # A step that stays on its side has none.
+    # A step that stays on one side of the kink has no duals.
     has_duals, h = potential.friction(scene.x, scene.x).after(x, -0.5 * slide)
     assert not has_duals
     exact = potential.friction(scene.x, scene.x).hessian(scene.x + 0.5 * slide)
@@ -456,15 +456,15 @@ def test_duals_remember_the_other_side_of_a_kink(name):
 @pytest.mark.parametrize("lag", ["start", "end"])
 @pytest.mark.parametrize("angle", [1e-3, 0.1, 1.0])
 @pytest.mark.parametrize("name", NAMES)
-def test_what_moves_as_one_has_no_friction(name, angle, lag):
-    """Rigid motion of all, bodies and cloths: from either end, whatever the slip velocity."""
+def test_common_rigid_motion_has_no_friction(name, angle, lag):
+    """Rigid motion of all bodies and cloths, lagged at either end, for any slip velocity."""
     scene = contact_scenes.make(name)
     potential = scene.potential(slip=1e-9)
     start = scene.x
     end = start @ rotation(angle, 1).T + [0.3, -0.2, 0.5]
     friction = potential.friction({"start": start, "end": end}[lag], start)
     g, sliding = friction.gradient(end), friction.gradient(moved(scene, 0.003, 6))
-    # Rounding of positions over the slip, as a part of full friction.
+    # Rounding of positions divided by the slip, relative to full friction.
     assert np.abs(g).max() < 1e-5 * np.abs(sliding).max()
     assert abs(friction.energy_change(start, end)) < 1e-13
 
@@ -474,7 +474,7 @@ def test_what_moves_as_one_has_no_friction(name, angle, lag):
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 @pytest.mark.parametrize("name", NAMES)
 def test_friction_has_no_couple(name, angle, amount):
-    """Where it has been lagged, however the gap has changed and turned since the start."""
+    """At the lagged positions, for any change and rotation of the gap since the start."""
     scene = contact_scenes.make(name)
     start = moved(scene, 1e-4)
     rng = np.random.default_rng(7)
@@ -514,9 +514,9 @@ def edge_to_edge(degrees):
     ],
 )
 def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(start, lag, face):
-    """A face takes the couple of friction about the gap with its third vertex, too.
+    """The couple of friction about the gap also acts on the third vertex of a face.
 
-    It is that where edges cross at angles of `start` and `lag` degrees, and either is small.
+    This is the case if either of the edges' crossing angles `start` and `lag` [degrees] is small.
     """
     scene = edge_to_edge(lag)
     x = scene.x.copy()
@@ -528,7 +528,7 @@ def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(sta
 
 @pytest.mark.parametrize("where", ["start", "lag"])
 def test_a_face_that_is_a_line_turns_no_gap(where):
-    """Its vertices do not say how it turns; friction there goes without."""
+    """The vertices of a degenerate face define no rotation; friction there omits the rotation."""
     scene = edge_to_edge(0)
     flat = scene.x.copy()
     flat[5] = 0.5 * (flat[3] + flat[4])
@@ -552,7 +552,7 @@ def test_energies_are_comparable_between_positions(name):
 
 
 def test_touching_is_infinite():
-    """Also where a weight at the same distance is negative."""
+    """This holds also if another weight at the same distance is negative."""
     scene = contact_scenes.make("on_relief")
     x = scene.x.copy()
     body = scene.surface == 1

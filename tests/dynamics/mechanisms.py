@@ -1,4 +1,4 @@
-"""Mechanisms for tests: random trees, a pendulum, and the same things in Pinocchio."""
+"""Mechanisms for tests: random trees, a pendulum, and their models in Pinocchio."""
 
 import numpy as np
 import torch
@@ -125,7 +125,7 @@ def inertia_of(mechanism, armature=None):
 
 
 def random_configuration(mechanism, rng):
-    """Root pose [1, 7], joints [1, J] and velocities nu [1, 6 + J]; at rest where it is fixed."""
+    """Root pose [1, 7], joints [1, J] and velocities nu [1, 6 + J]; a fixed root is at rest."""
     quaternion = rng.normal(size=4)
     pose = np.concatenate([rng.uniform(-1, 1, 3), quaternion / np.linalg.norm(quaternion)])
     velocity = rng.uniform(-3, 3, 6 + mechanism.joint_count)
@@ -142,13 +142,13 @@ def frame_of(pose):
 
 
 class Judge:
-    """A mechanism in Pinocchio, whose velocities are brought to ours."""
+    """A mechanism in Pinocchio, with velocities converted to our convention."""
 
     def __init__(self, pin, mechanism):
         self.pin, self.mechanism = pin, mechanism
         self.tree = DifferentialKinematics(mechanism)
         self.model = model = pin.Model()
-        joint = {}  # link -> its joint in Pinocchio, and its place in that joint's frame
+        joint = {}  # link -> its joint in Pinocchio, and its pose in the joint's frame
         self.rows = []  # moving links in the order of their joints
         for l in depth_first(mechanism, mechanism.root):  # as Pinocchio's mass matrix needs
             inertia = pin.Inertia(mechanism.mass[l], mechanism.center[l], mechanism.inertia[l])
@@ -181,7 +181,7 @@ class Judge:
         return np.concatenate([pose[:3], pose[4:], pose[3:4], own])
 
     def to_ours(self, rotation):
-        """C: our velocities are C times those of Pinocchio's free root and our joints."""
+        """Matrix C: our velocities are C times Pinocchio's root velocity and our joint rates."""
         center = self.mechanism.center[self.mechanism.root]
         C = np.eye(self.free + self.mechanism.joint_count)
         if self.free:

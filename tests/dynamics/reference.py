@@ -1,11 +1,10 @@
-"""What the core's recursions along a tree are tested against, by Jacobians and autograd in torch.
+"""Reference for the core's recursions along a tree, by Jacobians and autograd in torch.
 
-Let joint j turn about the axis z through the point o, and let F and N be the momentum and the
-angular momentum about o of all links that it carries. A turn of the joint moves all links that it
-carries and no others, so the kinetic energy T = p . nu / 2 grows with its value, at constant rates,
-by
+Joint j turns about the axis z through the point o; F and N are the momentum and the angular
+momentum about o of all links that the joint carries. A rotation of the joint moves these links and
+no others, so at constant rates the derivative of the kinetic energy T = p . nu / 2 by its value is
 
-    dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F where it slides).
+    dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F if it slides).
 """
 
 import torch
@@ -29,7 +28,7 @@ def slope(kinematics, motion, velocity):
     momenta = link_momenta(motion, velocity)
     linear = momenta[..., :3]
     carried = about_origin(frames.centers, momenta)
-    # Of all links that each joint carries, first about the origin, then about the pivot.
+    # Momentum of all links that each joint carries, first about the origin, then about the pivot.
     F, N = torch.split(product(kinematics.reach.T[None], carried), 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)
     rate, omega = torch.split(twists[..., kinematics.moving, :], 3, dim=-1)

@@ -45,7 +45,7 @@ def make_scene(actuation="pd", gravity=(0, 0, -9.81), base="floating"):
 
 
 def raised(poses, row):
-    """With one body 1 cm higher."""
+    """Poses with one body 1 cm higher."""
     return poses.index_add(1, torch.tensor([row]), tensor([[[0, 0, 0.01, 0, 0, 0, 0]]]))
 
 
@@ -101,11 +101,11 @@ def test_rows_of_a_prediction(world):
     for rows in (p.coordinates, p.coordinate_ends, p.coordinate_targets):
         assert rows.shape == (1, 20)
     assert p.coordinate_metric.shape == (1, 36 + 36 + 64)
-    # What is not free passes unchanged; a free root's frame is the same at both ends.
+    # Rows that are not free remain unchanged; a free root's frame is the same at both ends.
     assert torch.equal(p.body_poses[:, [0, 2]], state["body_poses"][:, [0, 2]])
     assert torch.equal(p.body_targets[:, [0, 2]], control["body_poses"][:, [0, 2]])
     assert torch.equal(p.body_poses[:, [1, 3, 4]], p.body_targets[:, [1, 3, 4]])
-    # Its points are at c + exp(w) (S v), here where the state says.
+    # Points of a free root are at c + exp(w) (S v), here equal to the state's points.
     v = tensor([[0.1, 0.2, -0.3]])
     for row, pose, first in ((1, state["body_poses"][0, 1], 0), (4, state["base_poses"][0, 0], 12)):
         c, w = p.coordinates[0, first : first + 3], p.coordinates[0, first + 3 : first + 6]
@@ -116,7 +116,7 @@ def test_rows_of_a_prediction(world):
 
 
 def origins(dynamics, state, parameters):
-    """Where bodies and robots were a step before, as the numbers that the cloth is told."""
+    """Poses of bodies and robots one step earlier, flattened as the cloth solve receives them."""
     places = dynamics.last_places(state, parameters)
     return torch.cat([values.flatten(1) for values in places.values()], dim=1)
 
@@ -172,7 +172,7 @@ def roller(folder, base):
 
 
 def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
-    """Whatever the order of links in the file: the root turns about its own center of mass."""
+    """For any order of links in the file, the root turns about its own center of mass."""
     robot = roller(tmp_path, "floating")
     scene = dc.Scene([], [], [robot])
     assembly = assemble(scene)
@@ -229,8 +229,8 @@ def test_fields_of_the_state_after(world):
 
 
 @pytest.mark.parametrize("speed", [1.2, 0.9])
-def test_what_turns_fast_may_not_be_touched(world, speed):
-    """Before the step or after it; what touches another body does not count."""
+def test_a_body_that_turns_fast_must_not_have_contact(world, speed):
+    """The limit applies before and after the step; contact of other bodies does not count."""
     assembly, dynamics, parameters, state, control = world
     fast = tensor([0, 0, 0, speed / H, 0, 0]) * tensor([0, 1, 0, 0])[:, None]
     state = {**state, "body_velocities": fast[None]}
@@ -253,10 +253,10 @@ def test_what_turns_fast_may_not_be_touched(world, speed):
     assert "body 'a' turns at" in far(on[0], spun)[0]
 
 
-def test_of_several_that_turn_too_far_the_first_is_told_of(world):
-    """With its own speed, the larger of those before and after, and a time step that is enough.
+def test_the_first_of_several_bodies_that_turn_too_far_is_named(world):
+    """The error has its speed, the larger of before and after, and a sufficient time step.
 
-    Forces that cancel touch too.
+    Forces that cancel also count as contact.
     """
     assembly, dynamics, parameters, state, control = world
     spins = tensor([[0, 0, 0], [0, 2.0 / H, 0], [0, 0, 0], [0, 3.0 / H, 0]])
@@ -276,9 +276,9 @@ def test_of_several_that_turn_too_far_the_first_is_told_of(world):
 
 @pytest.mark.parametrize("by", ["kick", "prediction"])
 def test_forces_turn_a_body_about_its_center_of_mass(world, by):
-    """Its angular momentum about the origin grows by h times the moments of the forces there.
+    """The body's angular momentum about the origin grows by h times the moments of the forces.
 
-    Where the forces act: on its points at the end of the step, or at the start.
+    The forces act on its points at the end of the step (kick) or at the start (prediction).
     """
     assembly, dynamics, parameters, state, control = world
     rng = np.random.default_rng(11)
@@ -350,7 +350,7 @@ def test_a_robot_under_position_control_needs_no_masses():
     after, alone = (dynamics.advance(p, ends, f) for f in (forces, 0 * forces))
     assert torch.equal(after["joint_positions"], control["joint_positions"])
     contact = after["joint_efforts"] - alone["joint_efforts"]
-    # The constraint holds against contact too: fingers slide along y, apart from each other.
+    # The constraint resists contact too: fingers slide along y, apart from each other.
     rows = dict(zip(assembly.surface_names[1:], range(99), strict=False))
     for j, finger in enumerate(("left_finger", "right_finger")):
         s = rows[f"grip/{finger}"]
@@ -391,7 +391,7 @@ def test_a_joint_rests_on_its_limit_near_its_beginning():
 
 @pytest.mark.parametrize("dt", [0.01, 0.002])
 def test_a_limit_without_weight_is_as_stiff_as_its_joint_is_heavy(dt):
-    """k = M_jj / h^2: a joint that meets it in a step is turned back by its own inertia."""
+    """k = M_jj / h^2: the joint's own inertia turns back a joint that meets its limit in a step."""
     assembly = assemble(make_scene(actuation="torque", base="fixed"))
     (hand,) = assembly.mechanisms[-1:]
     heavy = replace(assembly, joint_armature=np.array([0.02, 0.05]))
@@ -409,7 +409,7 @@ def test_joints_without_a_limit_to_keep_have_no_barrier():
 
 
 def spring_forces(assembly, coordinates):
-    """Made-up forces of a cloth that depend on where bodies are."""
+    """Artificial cloth forces, linear in the coordinates of the bodies."""
     rng = np.random.default_rng(5)
     shape = (coordinates.shape[1], len(assembly.body_vertices) * 3)
     matrix = tensor(rng.normal(size=shape, scale=0.01))
@@ -417,7 +417,7 @@ def spring_forces(assembly, coordinates):
 
 
 def solvers(assembly, seen, among=0.0):
-    """Solves without contact, but with these forces `among` bodies and robots."""
+    """Solves without contact, but with the forces `among` between bodies and robots."""
 
     def solve_rigid(prediction):
         seen.append(("rigid", prediction))
@@ -482,8 +482,8 @@ def test_cloth_to_rigid_lets_the_cloth_go_first(world):
     assert (result.fields["joint_velocities"] != free["joint_velocities"]).all()
 
 
-def test_the_cloth_sees_what_is_prescribed_at_its_end_and_the_rest_still():
-    """With `cloth_to_rigid`; from there the rest moves, after the cloth."""
+def test_the_cloth_meets_prescribed_joints_at_their_end_and_others_at_rest():
+    """Order `cloth_to_rigid`: other coordinates move after the cloth, from their start values."""
     scene = make_scene(actuation=("position", "pd"), base="fixed")
     assembly = assemble(scene)
     dynamics, parameters = Dynamics(assembly, H), parameters_of(scene, assembly)
@@ -508,7 +508,7 @@ def test_the_cloth_sees_what_is_prescribed_at_its_end_and_the_rest_still():
 
 @pytest.mark.parametrize("order", ["rigid_to_cloth", "cloth_to_rigid"])
 def test_forces_among_bodies_are_in_the_result_and_held(order):
-    """A step's forces are those of both solves, and what holds a joint holds against both."""
+    """A step's forces are the sum of both solves, and prescribed joints' efforts balance both."""
     scene = make_scene(actuation="position", base="fixed")
     assembly = assemble(scene)
     dynamics, parameters = Dynamics(assembly, H), parameters_of(scene, assembly)
@@ -559,7 +559,7 @@ def test_gradients_through_couplings(world, order):
 
     inputs = [state[name] for name in names] + [parameters["body_mass"], parameters["link_mass"]]
     inputs = [t.clone().requires_grad_() for t in inputs]
-    # Forces of order 10 on light things: differences of velocities of order 10.
+    # Forces of order 10 on light bodies: differences of velocities of order 10.
     assert torch.autograd.gradcheck(go, inputs, rtol=1e-5, atol=1e-6, fast_mode=True)
 
 

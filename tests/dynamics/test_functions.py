@@ -38,7 +38,7 @@ CASES = [
 
 
 class Robot:
-    """A random robot in three environments, and what it is asked for."""
+    """A random robot in three environments, with its state, control and forces."""
 
     def __init__(self, name, base, speed=1.0, prescribed=False):
         kinds, parents = TREES[name]
@@ -46,7 +46,7 @@ class Robot:
         rng = np.random.default_rng(list(TREES).index(name))
         self.mechanism = make(kinds, parents, base=base, rng=rng, mimic=mimic)
         J = self.mechanism.joint_count
-        if prescribed:  # every other joint, where there are enough
+        if prescribed:  # every other joint
             modes = tuple("velocity" if j % 2 else "torque" for j in range(J))
             self.mechanism = make(
                 kinds,
@@ -62,7 +62,7 @@ class Robot:
         self.dynamics = RobotDynamics(self.mechanism, H, links, points)
         drawn = [random_configuration(self.mechanism, np.random.default_rng(s)) for s in range(3)]
         pose, joints, nu = (torch.cat(parts) for parts in zip(*drawn, strict=True))
-        # That of a fixed base is ignored.
+        # The velocity of a fixed base is ignored.
         velocity = tensor(rng.normal(size=(3, 6))) if base == "fixed" else speed * nu[:, :6]
         self.state = RobotState(pose, velocity, joints, speed * nu[:, 6:])
         self.inertia = inertia_of(self.mechanism, rng.uniform(0.1, 0.2, J))
@@ -143,7 +143,7 @@ def test_the_velocities_solve_the_equation(name, base, prescribed, speed):
     nu, solved = prediction.velocity, robot.solved
     middle = robot.after(nu, H / 2)
     left = momentum(middle, robot.acting, nu) - H / 2 * slope(robot.kinematics, middle, nu)
-    assert nu[:, solved].abs().min() > 1e-3  # all of them are asked for something
+    assert nu[:, solved].abs().min() > 1e-3  # every solved row has an impulse
     known = [i for i in range(nu.shape[1]) if i not in solved]
     assert torch.equal(nu[:, known], prediction.known[:, known])
     scale = float(prediction.given.abs().max())
@@ -163,8 +163,11 @@ def test_the_metric_is_the_mass_matrix_at_the_end(name, base):
 @pytest.mark.parametrize("prescribed", [False, True])
 @pytest.mark.parametrize(("name", "base"), CASES)
 def test_velocities_and_efforts_at_the_end(name, base, prescribed):
-    """M nu' = p + h/2 s + h kick, of a floating root the whole change of momentum, and what
-    prescribed joints lack of that. Nothing has moved it from its prediction."""
+    """The velocities satisfy M nu' = p + h/2 s + h kick, and efforts are the residual.
+
+    The rows of a floating root have the whole change of momentum; efforts act at prescribed
+    joints. The coordinates are the predicted ones.
+    """
     robot = Robot(name, base, prescribed=prescribed)
     p = robot.predict()
     kick = 0.5 * robot.forces.flip(0)
@@ -245,7 +248,7 @@ def outputs(function, given, threads=1):
 
 
 def test_derivatives_are_those_by_differences_and_adjoint_to_each_other():
-    """<u, J v> = <J^T u, v> for each input, where several environments share some of them."""
+    """<u, J v> = <J^T u, v> for each input, some of which several environments share."""
     function, _ = robot_functions()
     given = arrays()
     rng = np.random.default_rng(1)

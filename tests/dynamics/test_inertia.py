@@ -58,7 +58,7 @@ def motion_at(judge, pose, joints):
 
 
 def own_rows(judge, values):
-    """Without the six of the root where it does not move."""
+    """Values without the six rows of a root that does not move."""
     return values if judge.free else values[..., 6:]
 
 
@@ -152,7 +152,7 @@ def test_forces_at_points(judge):
 
 
 def test_acceleration_without_mimic():
-    """The whole of it: M qdd + bias = tau + J^T f, against the articulated-body algorithm."""
+    """M qdd + bias = tau + J^T f, against the articulated-body algorithm."""
     judge = Judge(pin, make(*TREES["sliding"], rng=np.random.default_rng(5)))
     pose, joints, nu, q, v, _ = state(judge)
     judge.model.gravity.linear = G

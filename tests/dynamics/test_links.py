@@ -79,7 +79,7 @@ def test_totals_are_those_of_the_mass_matrix(judge):
 
 
 def test_derivatives_are_those_that_the_core_records(judge):
-    """And the reverse of the tangents. Python computes them from frames and twists."""
+    """Derivatives computed in Python from frames and twists equal the core's, in both modes."""
     mechanism = judge.mechanism
     if not mechanism.joint_count:
         pytest.skip("no joints")

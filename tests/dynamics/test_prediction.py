@@ -52,7 +52,7 @@ def fly(poses, velocities, steps, *, inertia=None, wrench=(0,) * 6, gravity=GRAV
 
 @pytest.mark.parametrize("rate", [3.0, 10.0, 30.0])
 def test_a_tumbling_body_keeps_momentum_and_energy(rate):
-    spin = rate * tensor([0.02, 1.0, 0.01])  # near the unstable axis, so that it tumbles
+    spin = rate * tensor([0.02, 1.0, 0.01])  # near the unstable axis, so the body tumbles
     velocities = torch.cat([torch.zeros(3, dtype=F64), spin]).reshape(1, 1, 6)
     with torch.no_grad():
         flight = fly(AT_ORIGIN[None], velocities, 1000)
@@ -62,7 +62,7 @@ def test_a_tumbling_body_keeps_momentum_and_energy(rate):
     assert turned.std(0).min() > 0.1
     # Rounding of a thousand rotations.
     assert (L - L[0]).norm(dim=-1).max() < 1e-12 * L[0].norm()
-    # Second order in h times the rate: 1e-3 at 10 rad/s is asked for.
+    # Second order in h times the rate; 1e-3 at 10 rad/s is required.
     assert (energy / energy[0] - 1).abs().max() < 1e-3 * max(1.0, (rate / 10) ** 2) / 2
 
 
@@ -76,7 +76,7 @@ def test_free_fall():
 
 
 def test_a_torque_turns_a_body_about_a_principal_axis():
-    """omega_n = n h tau / I, and the angle is that of implicit Euler."""
+    """omega_n = n h tau / I, with the angle of implicit Euler."""
     flight = fly(AT_ORIGIN[None], torch.zeros(1, 1, 6, dtype=F64), 20, wrench=(0, 0, 0, 0, 0, 0.3))
     pose, velocity, momentum = flight[-1]
     rate = 20 * H * 0.3
@@ -114,7 +114,7 @@ def test_a_torque_acts_in_world_axes():
 
 
 def test_contact_gives_the_body_exactly_its_impulse():
-    """A (q - t) is the generalized force; as a torque in world axes it changes L by h times it."""
+    """A (q - t) is the generalized force; h times its torque in world axes is the change of L."""
     prediction = predict_bodies(
         tensor([[[0, 0, 0, 0.8, 0, 0.6, 0]]]),
         tensor([[[0, 0, 0, 4.0, 2.0, -7.0]]]),
@@ -207,7 +207,7 @@ def at_rest(chain, joints=None, pose=AT_ORIGIN, velocity=None, rates=None):
 
 
 def step(chain, state, *, control=None, drives=None, gravity=GRAVITY, inertia=None):
-    """One step that only the quadratic terms act on: the core's solution is then known."""
+    """One step with quadratic terms only, for which the core's solution is known."""
     inertia = inertia_of(chain.mechanism) if inertia is None else inertia
     p = chain.predict(state, control or controls(chain), inertia, drives or gains(chain), gravity)
     q = torch.where(chain.prescribed, p.ends, p.target)
@@ -244,8 +244,11 @@ def energies(chain, state, gravity):
 @pytest.mark.parametrize("gravity", [0.0, -9.81])
 @pytest.mark.slow
 def test_a_double_pendulum_keeps_its_energy(rate, tolerance, gravity):
-    """Over 10 s. Forces act before velocities move positions, as on free bodies, which shifts
-    the energy by h/2 times their power; the rest of it is kept."""
+    """Energy is conserved over 10 s, up to a shift.
+
+    Forces act before velocities move positions, as for free bodies, which shifts the energy by
+    h/2 times their power.
+    """
     chain = make_chain(pendulum())
     g = tensor([[0, 0, gravity]])
     state = at_rest(chain, tensor([[0.5, 1.0]]), rates=tensor([[rate, -rate / 2]]))
@@ -279,7 +282,7 @@ def test_a_floating_chain_keeps_its_momentum():
     for n in range(1, 51):
         _, state, _ = step(chain, state)
         now, turning = momenta(state)
-        # What eight iterations at 3 rad/s leave.
+        # Remaining error of eight iterations at 3 rad/s.
         expected = linear + n * H * total * GRAVITY[0]
         torch.testing.assert_close(now, expected, rtol=0, atol=1e-10)
     weightless = RobotState(pose, nu[:, :6], joints, nu[:, 6:])
@@ -290,7 +293,7 @@ def test_a_floating_chain_keeps_its_momentum():
     torch.testing.assert_close(turning, angular, rtol=0, atol=1e-9)
 
 
-def test_one_link_on_a_floating_base_moves_like_a_body():
+def test_a_single_link_on_a_floating_base_moves_like_a_body():
     mechanism = make(*TREES["body"], base="floating", rng=np.random.default_rng(3))
     chain = make_chain(mechanism)
     pose, _, nu = random_configuration(mechanism, np.random.default_rng(4))
@@ -311,7 +314,7 @@ def test_motion_converges_to_that_of_an_accelerated_pivot():
     mechanism = pendulum(lengths=(1.0,), masses=(1.0,), base="kinematic")
     chain = make_chain(mechanism)
     a, n = 3.0, 60
-    angle = -math.atan2(a, 9.81)  # about y, which takes the bob below to -x: it lags behind
+    angle = -math.atan2(a, 9.81)  # about y, which moves the bob below to -x: the bob lags behind
     state = at_rest(chain, tensor([[-angle]]))
     for k in range(1, n + 1):
         # Positions of the scheme itself for the acceleration a.
@@ -337,7 +340,7 @@ def test_prescribed_joints_arrive_exactly():
 
 
 def test_a_position_target_is_reached_to_the_last_bit():
-    """Not up to the rounding of the velocity that leads there."""
+    """The rounding of the velocity towards the target has no effect."""
     rng = np.random.default_rng(9)
     mechanism = make(*TREES["chain"], rng=rng, actuation=("position", "torque", "position"))
     chain = make_chain(mechanism)
@@ -375,7 +378,7 @@ def test_efforts_of_prescribed_joints_move_a_free_chain_alike():
     assert fine < 0.6 * coarse
 
 
-def test_a_prescribed_joint_takes_what_a_drive_beside_it_does():
+def test_a_prescribed_joint_balances_the_drive_beside_it():
     rng = np.random.default_rng(8)
     mixed = make_chain(make(*TREES["chain"], rng=rng, actuation=("position", "pd", "position")))
     _, joints, _ = random_configuration(mixed.mechanism, rng)
@@ -386,7 +389,7 @@ def test_a_prescribed_joint_takes_what_a_drive_beside_it_does():
     free = make_chain(make_like(mixed.mechanism, actuation=("torque",) * 3))
     pushed = controls(free, efforts=efforts)
     _, again, _ = step(free, at_rest(free, joints), control=pushed)
-    # One takes the masses at the end of the motion without drives, the other those on its way.
+    # The masses differ: `mixed` uses the end of the motion without drives, `free` its midpoint.
     moved = (after.joints - joints).abs().max()
     assert (again.joints - after.joints).abs().max() < 0.01 * moved
 
@@ -460,7 +463,7 @@ def test_velocities_beyond_half_a_turn_in_a_step_are_refused():
 
 
 def test_a_body_that_turns_too_fast_is_refused():
-    """With the environment, and only where it does."""
+    """Only the environment of the body fails, and is named."""
     spins = torch.zeros(2, 1, 6, dtype=F64)
     spins[:, 0, 3:] = tensor([[1.0, 2.0, 3.0], [1e200, 0.0, 1e200]])
     inertia = BodyInertia(tensor([[1.0]]), tensor([[[0, 0, 0]]]), tensor([[np.diag([1, 2, 2.5])]]))
@@ -483,7 +486,7 @@ CASES = [
 
 @pytest.mark.parametrize(("base", "actuation"), CASES)
 def test_gradients_of_robots(base, actuation):
-    """Everything that goes in, after two steps."""
+    """Gradients by every input, after two steps."""
     rng = np.random.default_rng(7)
     mechanism = make(*TREES["chain"], base=base, rng=rng, actuation=actuation)
     points, links = tensor(rng.normal(size=(3, 3))), torch.tensor([0, 2, 3])
@@ -528,7 +531,7 @@ def test_gradients_of_robots(base, actuation):
 
     inputs = (pose, nu, joints, end, wrench, targets, *weights, drive, GRAVITY, forces, offset)
     inputs = [t.clone().requires_grad_() for t in inputs]
-    # Efforts of position joints are of order 1e4: the rounding of their differences.
+    # Efforts of position joints are of order 1e4; the tolerance is the rounding of differences.
     assert torch.autograd.gradcheck(two_steps, inputs, rtol=1e-5, atol=1e-4, fast_mode=True)
 
 
@@ -572,7 +575,7 @@ def test_bodies_have_the_same_bits_alone_and_in_a_batch():
 @pytest.mark.parametrize(("turn", "is_lost"), [(3.0, False), (3.3, True)])
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 def test_half_a_turn_in_a_step_is_the_limit(base, turn, is_lost):
-    """Of a joint; and of a base, which turns here by itself."""
+    """The limit holds for a joint, and for a base, which here rotates alone."""
     mechanism = make(*TREES["body" if base == "floating" else "chain"], base=base,
                      rng=np.random.default_rng(0))  # fmt: skip
     if base == "floating":
@@ -580,7 +583,7 @@ def test_half_a_turn_in_a_step_is_the_limit(base, turn, is_lost):
         velocity = tensor([[0, 0, 0, turn / H, 0, 0]])
         chain = make_chain(mechanism)
         state = at_rest(chain, velocity=velocity)
-    else:  # one joint, so that its speed stays
+    else:  # a single joint, whose speed is constant
         mechanism = pendulum(lengths=(1.0,), masses=(1.0,))
         chain = make_chain(mechanism)
         state = at_rest(chain, rates=tensor([[turn / H]]))
@@ -590,7 +593,7 @@ def test_half_a_turn_in_a_step_is_the_limit(base, turn, is_lost):
 
 
 def test_a_robot_that_is_too_fast_has_a_finite_metric():
-    """Its environment fails; the solver is given numbers there, too."""
+    """The environment fails, but the solver still receives finite numbers for it."""
     chain = make_chain(make(*TREES["chain"], rng=np.random.default_rng(0)))
     rates = tensor([[1e200, 0, 0], [1.0, 2.0, 3.0]])
     state = at_rest(chain, joints=tensor([[0.1, 0.2, 0.3]]).expand(2, 3), rates=rates)
@@ -608,7 +611,7 @@ def test_a_robot_that_is_too_fast_has_a_finite_metric():
 
 @pytest.mark.parametrize("h", [0.05, 0.2, 0.4])
 def test_the_metric_of_a_long_fall_from_rest_is_positive(h):
-    """What makes it balance the forces at rest changes it by less than itself."""
+    """The correction that balances the forces at rest is smaller than the metric."""
     rng = np.random.default_rng(3)
     chain = RobotDynamics(pendulum((1.0, 0.5, 0.5), (1.0, 1.0, 1.0)), h, NO_LINKS, NO_POINTS)
     for _ in range(20):

@@ -23,7 +23,7 @@ TREES = {
 GRAVITY = torch.tensor([[1.0, -2.0, -9.0]], dtype=F64)
 
 
-# So long a step [s] that the metric M / h^2 + K of a step at rest is K, to rounding.
+# A step [s] so long that the metric M / h^2 + K of a step at rest is K, to rounding.
 LONG = 1e8
 
 
@@ -49,7 +49,7 @@ def stiffness(mechanism, weight, at):
 
 
 def energy(mechanism, at, x):
-    """Of the weight, after a motion x of the root and the joints."""
+    """Potential energy of the weight after a motion x of the root and the joints."""
     inertia = inertia_of(mechanism)
     local = inertia.center[:, mechanism.root]
     rotation = quaternion_matrix(at.pose[:, 3:])
@@ -66,7 +66,7 @@ def configuration(mechanism, rng):
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_it_is_the_second_derivative_of_the_energy(name):
+def test_the_stiffness_is_the_second_derivative_of_the_energy(name):
     kinds, parents, mimic = TREES[name]
     rng = np.random.default_rng(4)
     mechanism = make(kinds, parents, base="floating", rng=rng, mimic=mimic)
@@ -87,8 +87,8 @@ def test_it_is_the_second_derivative_of_the_energy(name):
 
 
 @pytest.mark.parametrize("name", TREES)
-def test_the_bound_is_above_it_in_all_configurations(name):
-    """Except where joints shift: the bound counts with their present values."""
+def test_the_bound_is_above_the_stiffness_in_all_configurations(name):
+    """Sliding joints are an exception: the bound uses their present values."""
     kinds, parents, mimic = TREES[name]
     rng = np.random.default_rng(5)
     mechanism = make(kinds, parents, base="floating", rng=rng, mimic=mimic)
@@ -103,11 +103,11 @@ def test_the_bound_is_above_it_in_all_configurations(name):
         exact = stiffness(mechanism, "exact", other)
         assert np.linalg.eigvalsh(bound - exact).min() > -1e-9 * bound.max()
         largest = max(largest, np.linalg.eigvalsh(exact).max())
-    assert largest > 0.05 * bound.max()  # it is not far too large
+    assert largest > 0.05 * bound.max()  # the bound is not far too large
 
 
 def test_the_bound_knows_how_far_links_are_from_the_center_of_the_root():
-    """A root turns about it, here far from its origin, where the other link is."""
+    """A root rotates about its center of mass, here far from its origin and the other link."""
     rng = np.random.default_rng(6)
     mechanism = make(["fixed", "revolute"], [-1, 0], base="floating", rng=rng)
     center = np.array([[5.0, 0.0, 0.0], [0.05, 0.0, 0.0]])

@@ -104,9 +104,9 @@ class DifferentialKinematics:
         mechanism: The mechanism.
         root: Index of the root link.
         moving: Links whose joint to the parent moves, length A.
-        reach: Whether joint a carries link l, as 0 or 1, shape [L, A].
-        revolute: Whether joint a turns, as 0 or 1, shape [A, 1].
-        leaders: Matrix from the values of the J joints to those of the A joints, shape [1, A, J].
+        reach: 1 if joint a carries link l, else 0, shape [L, A].
+        revolute: 1 if joint a turns, else 0, shape [A, 1].
+        leaders: Matrix from J joint values to the values of the A joints, shape [1, A, J].
     """
 
     def __init__(self, mechanism: Mechanism) -> None:

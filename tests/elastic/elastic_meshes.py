@@ -27,7 +27,7 @@ STATES = [
 
 
 def grid(nu: int, nv: int, diagonal: str = "right") -> tuple[np.ndarray, np.ndarray]:
-    """Unit cells split along one diagonal, the other, or in turns."""
+    """Unit cells split along one diagonal, the other, or alternating ones."""
     i, j = np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij")
     X = np.stack([i.ravel(), j.ravel(), 0 * i.ravel()], 1).astype(float)
     faces = []
@@ -130,7 +130,7 @@ def slivers(aspect: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def on_cylinder(X: np.ndarray, curvature: float, angle: float) -> np.ndarray:
-    """Roll a flat sheet onto a cylinder; `angle` is that of the bent direction."""
+    """Roll a flat sheet onto a cylinder; `angle` is between x and the bent direction [rad]."""
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
     s, t = X[:, :2] @ along, X[:, :2] @ across
@@ -198,7 +198,7 @@ def model(
     x_n: np.ndarray | None = None,
     **woven: float | np.ndarray,
 ) -> Elastic:
-    """A model; of woven cloth where `angles` of the warp to the first sides of faces are given."""
+    """A model; woven if `angles` from the first sides of faces to the warp are given."""
     elastic = Elastic(X, faces, bending_model)
     set_parameters(
         elastic,
@@ -239,7 +239,7 @@ def set_parameters(
 
 
 def angles_along(X: np.ndarray, faces: np.ndarray, direction: float) -> np.ndarray:
-    """Angles to the first sides of the faces of a flat mesh of what lies at an angle to x."""
+    """Angles from the first sides of a flat mesh's faces to a direction, given from x [rad]."""
     side = X[faces[:, 1]] - X[faces[:, 0]]
     return direction - np.arctan2(side[:, 1], side[:, 0])
 

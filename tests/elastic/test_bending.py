@@ -1,4 +1,4 @@
-"""The bending energy: the stiffness that it is given, what costs nothing, its derivatives."""
+"""The bending energy: effective stiffness, motions without energy, derivatives."""
 
 import numpy as np
 import pytest
@@ -40,8 +40,8 @@ def test_patch_has_the_stiffness_it_is_given(name, poisson):
     assert ratio.max() / ratio.min() < 1.01
 
 
-def test_hinge_does_not():
-    """The known defect of the hinge, which the patch is there for."""
+def test_hinge_is_stiffer_than_given():
+    """The known defect of the hinge model, which the patch model avoids."""
     ratio = cylinder_ratios("right", "hinge", 0.0)
     assert ratio.min() > 2.5
     assert ratio.max() / ratio.min() > 2.0
@@ -66,7 +66,7 @@ def wave_ratio(X, faces, k):
 @pytest.mark.parametrize("aspect", [1, 2, 3, 4])
 @pytest.mark.parametrize("name", ["alternating", "right", "delaunay", "jittered"])
 def test_a_sine_wave_along_long_edges_has_its_energy(name, aspect, size):
-    """Curvature that varies: quadratics take a cubic along long edges for a curvature across."""
+    """Varying curvature: a quadratic fit maps a cubic along long edges to curvature across."""
     X, faces = squeezed(name, *size, aspect)
     bound = {16: 0.05, 32: 0.01}
     for edges, allowed in bound.items():
@@ -105,7 +105,7 @@ FREE_PLATE = np.array([13.49, 19.79, 24.43])
 
 @pytest.mark.parametrize("name", ["right", "left", "alternating", "delaunay"])
 def test_modes_of_a_free_plate(name):
-    """The stiffness after relaxation: single quadratics alone lose up to 45 % of it here."""
+    """The stiffness after relaxation, of which single quadratics lose up to 45 % here."""
     X, faces = MESHES[name](13, 13)
     X /= 12
     elastic = model(X, faces, bending=1.0, poisson=0.3)
@@ -114,7 +114,7 @@ def test_modes_of_a_free_plate(name):
     values = np.linalg.eigvalsh(scale[:, None] * H * scale)
     assert np.abs(values[:3]).max() < 1e-8  # affine maps and nothing else
     ratio = np.sqrt(values[3:6]) / FREE_PLATE
-    # 12 cells: 4 % of discretization error in the frequency of the saddle, a quarter of it at 24.
+    # 12 cells: 4 % of discretization error in the saddle's frequency; a quarter of this at 24.
     assert (ratio > 0.95).all()
     assert (ratio < 1.005).all()
 
@@ -163,7 +163,7 @@ def test_affine_maps_and_no_others_cost_nothing(name):
     scaled = scale[:, None] * H * scale
     assert np.abs(scaled @ basis[:, :3]).max() < 1e-11
     others = basis[:, 3:].T @ scaled @ basis[:, 3:]
-    # Between 1e-5 (slivers) and 1 on these meshes.
+    # The smallest eigenvalue is between 1e-5 (slivers) and 1 on these meshes.
     assert np.linalg.eigvalsh(others)[0] > 1e-6
 
 
@@ -342,7 +342,7 @@ def test_projected_hessian_is_positive_and_exact_at_rest(rest, bending_model):
 @pytest.mark.parametrize("rest", RESTS)
 @pytest.mark.parametrize("size", [1e-1, 1e-5, 1e-9])
 def test_energy_change_does_not_cancel(rest, bending_model, size):
-    """Against the midpoint rule, exact to third order in the step, where that is small."""
+    """Against the midpoint rule, exact to third order, for small steps."""
     X, faces = grid(4, 4)
     X = np.ascontiguousarray(rest(X))
     elastic = model(X, faces, bending_model, bending=D, poisson=0.3)

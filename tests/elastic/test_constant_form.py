@@ -1,4 +1,4 @@
-"""The constant form of Projective Dynamics: what it is, and what it is made of."""
+"""The constant quadratic form of Projective Dynamics and its elements."""
 
 from itertools import pairwise
 
@@ -40,7 +40,7 @@ def plate_form(p):
     twist = 4 * p["bending_twill"] - p["bending"] - p["bending_weft"] - 2 * coupled
     units = [np.array(u) for u in ([[1, 0], [0, 0]], [[0, 0.5], [0.5, 0]], [[0, 0], [0, 1]])]
     form = np.empty((3, 3))
-    # The entry uv of a curvature is one where that of both off-diagonals is.
+    # Unit curvatures have 1 in uu, in vv, or in both off-diagonal entries.
     turned = [Q.T @ (u * [[1, 2], [2, 1]]) @ Q for u in units]
     for i, a in enumerate(turned):
         for j, b in enumerate(turned):
@@ -105,7 +105,7 @@ def test_the_form_is_the_sum_of_its_elements(rest, bending_model, damped, woven)
 
 @pytest.mark.parametrize("woven", [False, True])
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
-def test_it_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_model, woven):
+def test_the_form_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_model, woven):
     """Flat, undamped, shear softer than yarns: no local/global iteration raises the energy."""
     rng = np.random.default_rng(1)
     elastic, X, _, _ = problem(False, bending_model, 0.0, woven, rng)
@@ -114,7 +114,7 @@ def test_it_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_
     H = elastic.hessian(x, False)
     gap = np.linalg.eigvalsh(np.kron(L, np.eye(3)) - H)
     assert gap.min() > -1e-12 * np.abs(H).max()
-    assert np.linalg.eigvalsh(H).min() < -1e-2  # not because it were positive itself
+    assert np.linalg.eigvalsh(H).min() < -1e-2  # the Hessian itself is indefinite
 
 
 def test_anchors_are_on_the_diagonal_and_constants_cost_nothing_without():

@@ -1,4 +1,4 @@
-"""Damping: no rigid motion feels it, everything else loses energy, its derivatives."""
+"""Damping: no force on rigid motion, energy loss of all other motion, derivatives."""
 
 import numpy as np
 import pytest

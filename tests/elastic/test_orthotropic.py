@@ -133,8 +133,8 @@ def yarn_lengths(X, x, angle):
 def test_projected_hessian_is_that_of_the_eigenvalues_of_the_form_of_f(ratio):
     """H = B^T h B with the map B from motions of the corners to changes of F, 6 x 9.
 
-    Where a yarn is so short that its own force turns it, k_wf + (k - k_wf) (1 - 1 / |y|) < 0, the
-    projection raises this stiffness first: it is then no smaller than the Hessian, and positive.
+    If a yarn is so short that its own force turns it, k_wf + (k - k_wf) (1 - 1 / |y|) < 0, the
+    projection raises this stiffness first; the result is positive and no smaller than the Hessian.
     """
     X, _ = TRIANGLE
     rng = np.random.default_rng(8)
@@ -152,7 +152,7 @@ def test_projected_hessian_is_that_of_the_eigenvalues_of_the_form_of_f(ratio):
         form = inverse.T @ elastic.hessian(x, False) @ inverse
         y, V = np.linalg.eigh(form)
         positive = elastic.hessian(x, True)
-        # What is left of an eigenvalue is of the size that rounding has beside the largest.
+        # A clamped eigenvalue is zero up to rounding of the largest.
         rounding = 1e-9 * np.abs(y).max()
         across = k[2] + (k[:2] - k[2]) * (1 - 1 / yarn_lengths(X, x, angle))
         if across.min() >= 0:
@@ -189,7 +189,7 @@ def test_energy_and_its_derivatives_turn_with_the_cloth(state):
     rng = np.random.default_rng(12)
     elastic = model(X, faces, angles=rng.uniform(-3, 3, len(faces)), **STRETCH)
     x = X @ state.T + 0.05 * rng.normal(size=X.shape)
-    R = rigid(np.eye(3)) - rigid(np.zeros((3, 3)))  # rows: where the axes go
+    R = rigid(np.eye(3)) - rigid(np.zeros((3, 3)))  # rows: images of the axes
     turned = np.ascontiguousarray(x @ R + [3.0, -2.0, 1.0])
     assert elastic.energy(turned) == pytest.approx(elastic.energy(x), rel=1e-12)
     np.testing.assert_allclose(elastic.gradient(turned), elastic.gradient(x) @ R, atol=1e-11 * K_W)
@@ -331,8 +331,8 @@ def test_uniaxial_stretch_has_the_traction_of_the_law(name, direction, s, error)
 
     e (k_w c^4 + k_f s^4 + 2 k_wf c^2 s^2),  c = cos phi,  s = sin phi:
 
-    k_w along the warp, k_f along the weft, at any strain; (k_w + k_f + 2 k_wf) / 4 along the bias
-    and what lies between, to first order.
+    k_w along the warp and k_f along the weft, at any strain; (k_w + k_f + 2 k_wf) / 4 along the
+    bias. In these and all other directions the law holds to first order.
     """
     X, faces = MESHES[name](5, 4)
     phi = np.radians(direction)
@@ -347,7 +347,7 @@ def test_uniaxial_stretch_has_the_traction_of_the_law(name, direction, s, error)
 
 @pytest.mark.parametrize("name", MESHES)
 def test_shear_between_warp_and_weft_has_its_own_stiffness(name):
-    """S = I + gamma (w f^T + f w^T) costs k_wf gamma^2 an area, whatever the other two are."""
+    """S = I + gamma (w f^T + f w^T) has energy k_wf gamma^2 per area, for any k_w and k_f."""
     X, faces = MESHES[name](5, 4)
     gamma = 1e-3
     elastic = model(X, faces, angles=angles_along(X, faces, 0.0), **STRETCH)
@@ -359,9 +359,9 @@ def test_shear_between_warp_and_weft_has_its_own_stiffness(name):
 @pytest.mark.parametrize("strain", [-0.3, -0.04, 0.0, 0.1, 0.6])
 @pytest.mark.parametrize("yarn", [0, 1])
 def test_tension_stiffens_shear_and_compression_softens_it(yarn, strain):
-    """Simple shear that turns the strained yarn, its ends kept parallel.
+    """Simple shear rotates the strained yarn and keeps its ends parallel.
 
-    It has the stiffness k_wf + (k - k_wf) e / (1 + e) - k_wf / (2 + e): k_wf / 2 at rest, and with
+    The stiffness is k_wf + (k - k_wf) e / (1 + e) - k_wf / (2 + e): k_wf / 2 at rest, and with
     the tension T = k e about k_wf / 2 + T, which is negative below T = -k_wf / 2.
     """
     X, faces = MESHES["delaunay"](5, 5)
@@ -399,8 +399,8 @@ def test_a_picture_frame_has_the_energy_of_its_angle(name, gamma):
 def test_a_strip_that_may_contract_has_the_compliance_of_the_law(name, direction):
     """A tension T along x alone strains along x by T (c^4 / k_w + s^4 / k_f + 2 c^2 s^2 / k_wf).
 
-    In material axes e_ww = T c^2 / k_w, e_ff = T s^2 / k_f, e_wf = -T c s / k_wf: on the bias it is
-    shear that gives way. No vertex but those at the ends has a force on it.
+    In material axes e_ww = T c^2 / k_w, e_ff = T s^2 / k_f, e_wf = -T c s / k_wf: on the bias the
+    strain is mostly shear. Only the vertices at the ends have forces.
     """
     X, faces = MESHES[name](6, 5)
     phi, tension = np.radians(direction), 1e-5 * K_F
@@ -444,7 +444,7 @@ def test_a_cylinder_at_an_angle_has_the_stiffness_of_the_law(name, angle):
 
 
 def test_equal_numbers_are_those_of_an_isotropic_cloth():
-    """Also bit for bit: where the three are equal, the isotropic kernels are used."""
+    """The results are bitwise equal: three equal numbers select the isotropic kernels."""
     X, faces = MESHES["jittered"](5, 4)
     x_n = X + 0.05 * RNG.normal(size=X.shape)
     x = x_n + 0.05 * RNG.normal(size=X.shape)
@@ -508,7 +508,7 @@ def test_damping_does_not_resist_rigid_motion(damped):
 
 
 def test_numbers_of_a_form_without_bending_have_finite_derivatives():
-    """Where D_w = D_f = 0 the derivatives add up to that of equal changes."""
+    """For D_w = D_f = 0 the derivatives add up to the derivative by equal changes."""
     X, faces = MESHES["jittered"](4, 4)
     x, z = on_cylinder(X, 0.2, 0.3), RNG.normal(size=X.shape)
     zero = dict.fromkeys(("bending", "bending_weft", "bending_twill"), 0.0)

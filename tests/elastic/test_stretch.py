@@ -1,4 +1,4 @@
-"""The stretch energy: what costs nothing, its traction law, its derivatives."""
+"""The stretch energy: motions without energy, traction law, derivatives."""
 
 import numpy as np
 import pytest
@@ -178,7 +178,7 @@ def test_energy_change_does_not_cancel(size):
 
 @pytest.mark.parametrize("positive", [False, True])
 def test_instructions_do_not_change_a_bit(positive):
-    """Regular, compressed, degenerate; their number is no multiple of that of the lanes."""
+    """Regular, compressed and degenerate faces; their number is no multiple of the lanes."""
     X, faces = jittered(6, 4)
     rng = np.random.default_rng(7)
     x0 = X * [0.9, 1.2, 1.0] + 0.2 * rng.normal(size=X.shape)

@@ -1,4 +1,4 @@
-"""What actions do: pickers, pins, forces, and the velocities of bodies and hands."""
+"""Effects of actions: pickers, pins, forces, and the velocities of bodies and hands."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class TestPickers:
         assert tools["held"].tolist() == [[0 if holds else -1]]
         weights = controls[0].attachment_weights["picker_0"][0]
         assert weights.tolist() == [0.5 * holds] + [0.0] * 8
-        if holds:  # from where the vertex is: nothing jumps
+        if holds:  # the target starts at the vertex, so the vertex does not jump
             torch.testing.assert_close(controls[0].attachments["picker_0"][0, 0], CORNER)
 
     def test_hold_what_they_have_until_they_open(self):
         pickers = Pickers(SHEET, 1, **PULL)
         _, tools = pickers.act(pickers.start(at(CORNER)), STATE, action((0, 0, 0), 1.0), 1)
-        # Beside another vertex: what is held stays, at the same distance.
+        # Beside another vertex the picker keeps its vertex, at the same distance.
         away = {**tools, "points": at(STATE.positions[0, 4])}
         _, kept = pickers.act(away, STATE, action((0, 0, 0), 1.0), 1)
         assert kept["held"].tolist() == [[0]]
@@ -134,8 +134,8 @@ def test_actions_beyond_their_range_are_clipped():
     assert torch.equal(ends[0].tools["points"], ends[1].tools["points"])
 
 
-def test_what_failed_has_no_graph_and_the_others_have(monkeypatch):
-    """Environment 1 fails in its second transition, and goes on from there."""
+def test_failed_environments_have_no_graph_and_others_have(monkeypatch):
+    """Environment 1 fails in its second transition, and continues from there."""
     env = dc.envs.make("FoldCloth", 2, size=6, opens_at=-1.0, reach=0.06, autoreset_mode="Disabled")
     env.reset(seed=0)
     from diffcloth_torch.envs import env as module

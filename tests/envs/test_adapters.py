@@ -1,4 +1,4 @@
-"""The same environments for libraries of reinforcement learning."""
+"""Adapters of the environments for reinforcement-learning libraries."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_stable_baselines_learns():
     assert reward.shape == (2,)
 
 
-def test_what_rsl_rl_asks_for():
+def test_rsl_rl_finds_its_interface():
     pytest.importorskip("tensordict")
     from diffcloth_torch.envs.rsl_rl import RslRlEnv
 
@@ -91,7 +91,7 @@ def test_what_rsl_rl_asks_for():
 
 
 class TestFailures:
-    """Environment 1 fails in its first step: every adapter charges all that is left."""
+    """Environment 1 fails in its first step: every adapter charges the rest of the episode."""
 
     @pytest.fixture
     def failing(self, monkeypatch):

@@ -1,4 +1,4 @@
-"""Environments for learning: interfaces, gradients, failures, seeds, and what policies get."""
+"""Environments for learning: interfaces, gradients, failures, seeds and observations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from diffcloth_torch.envs.spread_cloth import covered_area
 NAMES = tuple(envs.TASKS)
 SMALL = 6  # vertices along a side
 
-# What users start from is not thrown by the barrier.
+# The barrier must not throw the cloth in start states.
 pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
 
 
@@ -87,7 +87,7 @@ def test_gradients_of_a_return_are_those_of_differences(name):
     (gradient,) = torch.autograd.grad(total(leaf), leaf)
     noise = torch.Generator().manual_seed(0)
     direction = torch.randn(leaf.shape, generator=noise, dtype=torch.float64)
-    # Not beyond the limits of actions, where they are cut.
+    # Actions beyond their limits are clipped; differences must not reach the limits.
     direction = direction * (leaf.detach().abs() < 0.95)
     expected = float((gradient * direction).sum())
     errors = []
@@ -232,7 +232,7 @@ def test_the_next_start_of_an_environment_does_not_depend_on_those_of_others():
 
 
 def test_failure_changes_no_bit_of_the_others(monkeypatch):
-    """Environment 1 fails in its third step; it begins anew."""
+    """Environment 1 fails in its third step and is reset."""
     from diffcloth_torch.envs import env as module
 
     results = []
@@ -354,7 +354,7 @@ def begun():
         ("scripted", torch.zeros(1, 3), r"`scripted` must give finite floats \[B, 8\]"),
     ],
 )
-def test_what_a_task_gives_is_tried(name, value, message):
+def test_outputs_of_a_task_are_checked(name, value, message):
     wrong = type("Wrong", (envs.TASKS["FoldCloth"],), {"name": "Wrong", name: lambda s, e: value})
     with pytest.raises(dc.InvalidInput, match=message):
         envs.make(wrong(size=SMALL))

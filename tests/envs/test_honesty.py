@@ -1,4 +1,4 @@
-"""Tasks mean what they say: failing never pays, success is held, goals are observed."""
+"""Rewards of tasks are sound: failing never pays, success is held, goals are observed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from diffcloth_torch.envs.env import graded
 
 NAMES = tuple(envs.TASKS)
 SMALL = 6
-# Constant actions that drive what is prescribed into something, and the steps until they meet.
+# Constant actions that drive a prescribed object into an obstacle, and the steps until contact.
 INTO = {
     "LiftCloth": ([1.0, 0, 0, 0, 0, 0, 0], 2),
     "GraspCloth": ([1.0, 0, 0, 0, 0, 0, 0], 2),
     "HangCloth": ([1.0, 0, 0, 0, 0, 0, 0], 2),
     "PushCube": ([1.0, 0, 0, -1.0, 0, 0], 10),
 }
-# What each task draws of its goal, and a change of it.
+# Name of each task's random goal, and a change of the goal.
 GOALS = {
     "FoldCloth": ("line", 1), "FoldClothDiagonal": ("line", 1), "SpreadCloth": ("shift", 0.03),
     "DropCloth": ("away", 0.03), "FlingCloth": ("shift", 0.03), "LiftCloth": ("goal", 0.03),
@@ -70,7 +70,7 @@ def test_a_graded_reward_grows_everywhere_and_most_near_its_tolerance():
 
 @pytest.mark.parametrize("name", INTO)
 def test_a_motion_that_cannot_be_made_is_blocked(name):
-    """Environment 1 moves into something; the reward is the worst, and the episode goes on."""
+    """Environment 1 moves into an obstacle: the reward is the worst, and the episode continues."""
     action, steps = INTO[name]
     env = make(name, frame="world")
     env.reset(seed=0)
@@ -119,7 +119,7 @@ def test_blocking_changes_no_bit_of_the_others():
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_a_blocked_step_has_the_derivative_of_a_held_one(num_envs):
-    """Zero by its action, and by the action before it that of differences."""
+    """The derivative by its action is zero; by the action before, it matches differences."""
     env = make("LiftCloth", num_envs, frame="world", substeps=1)
     exact = dc.SolverOptions(throw=False, tolerance=1e-10)
     sim = env.task.simulator
@@ -197,7 +197,7 @@ def test_the_goal_is_observed(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_frames_change_axes_alone(name):
-    """The script moves the same things in both frames, and the world is the default nowhere."""
+    """The script has the same motion in both frames; no task defaults to the world frame."""
     states, rewards = [], []
     for frame in ("task", "world"):
         env = make(name, 2, frame=frame)
@@ -257,7 +257,7 @@ def test_folds_pair_material_at_all_sizes(name, size):
             assert float(moved.sum()) == pytest.approx(1.0)
             assert float(kept.sum()) == pytest.approx(1.0)
             assert not (kept[partner] * moved == 0)[moved > 0].all()
-            # Where material folds onto is its mirror image: all lengths are kept.
+            # Material folds onto its mirror image: all lengths are preserved.
             middle = 0.5 * (x + x[partner])
             pairs = (moved > 0).nonzero()[:, 0]
             distances = torch.cdist(x[pairs], x[pairs])
@@ -367,7 +367,7 @@ def run(env, act, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_starts_ask_for_feedback(name):
-    """Of 64 starts: the script, the actions of another episode, no actions, random ones."""
+    """Success over 64 starts: script, actions of another episode, no actions, random actions."""
     env = make(name, 64, size=7)
     actions = env.task.action_size
     noise = torch.Generator().manual_seed(0)

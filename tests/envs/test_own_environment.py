@@ -1,4 +1,4 @@
-"""The recipe of docs/environments.md: its environment works as a user would add it."""
+"""The recipe of docs/environments.md, followed as by a user, yields a working environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point clouds in the PCD format: text and bytes, and what is refused."""
+"""Point clouds in the PCD format: text, bytes and refused files."""
 
 from __future__ import annotations
 

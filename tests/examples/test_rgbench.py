@@ -1,4 +1,4 @@
-"""Captures in the format of RGBench, which these tests write, and fits to them."""
+"""Captures in the format of RGBench, written by these tests, and fits to the captures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def camera():
 
 
 def moved(start, t):
-    """Where a gripper is at a time: it swings."""
+    """Position of a swinging gripper at time t."""
     return np.asarray(start) + 0.05 * np.array([np.sin(8 * t), 0.0, 0.3 * np.sin(11 * t)])
 
 
@@ -88,7 +88,7 @@ def recorded(tmp_path_factory):
         file.write_text("\n".join(rows) + "\n")
     generator = np.random.default_rng(0)
     for step in (5, 10, 15, 20):
-        seen = states[step - 1].positions.numpy()[:28]  # the others no camera saw
+        seen = states[step - 1].positions.numpy()[:28]  # no camera saw the others
         seen = seen + 1e-3 * generator.standard_normal(seen.shape)
         points = seen @ camera()[:3, :3].T + camera()[:3, 3]
         name = f"pointcloud_{BEGIN + step * DT - DELAY:.6f}_segmented.pcd"

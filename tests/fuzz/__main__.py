@@ -2,20 +2,20 @@
 
     python tests/fuzz --minutes 5             # as many scenes as five minutes allow
     python tests/fuzz --scenes 100 --seed 3   # always the same hundred
-    python tests/fuzz --seed 3 --only 17      # one of them again
+    python tests/fuzz --seed 3 --only 17      # one of these scenes again
 
-A scene is a function of the seed and its index, and of `--draw`: scenes of odd indices throw cloths
-at bodies whose motion is given, those of even ones draw bodies, robots, couplings and schemes.
-ipctk judge every state and the polyline of every
-step, also of steps that fail. What is wrong is one line of JSON, which names the scene and what
-failed in it; steps that do not converge, or that are refused (an infeasible motion, a turn too fast
-for the time step), are counted, and listed with `--list`. The exit status is 1 if anything was
-wrong. Of the scheme `projective`, whose surfaces may cross, ipctk judge nothing.
+A scene is a function of the seed, its index and `--draw`: scenes of odd indices throw cloths at
+bodies with prescribed motion; even indices draw bodies, robots, couplings and schemes. ipctk
+judges every state and the polyline of every step, also of failed steps. An error is one line of
+JSON with the scene and the failed check. Steps that do not converge or that are refused (an
+infeasible motion, a rotation too fast for the time step) are counted, and listed with `--list`. The
+exit status is 1 if there was an error. ipctk does not judge the scheme `projective`, whose surfaces
+may cross.
 
-A gradient is compared with differences along a random direction. What buckles has several minima,
-and the least change of an input may let a step end in another: so gradients are taken at several
-points, and the two of them that agree best with the difference between them count, on whatever
-branch of minima they are. Suspects are listed, not judged: where there are very many minima, no two
+A gradient is compared with differences along a random direction. Buckling cloth has several minima,
+and the smallest change of an input may switch the minimum of a step: therefore gradients are
+computed at several points, and the two points that agree best with the difference between them
+count, on any branch of minima. Suspects are listed, not judged: with very many minima, no two
 points may share a branch.
 """
 
@@ -59,7 +59,7 @@ SUSPECT = 1e-3  # relative error of a gradient; right ones are below 2e-4
 
 
 class Tally:
-    """Counts, and the lines of what failed."""
+    """Counts, and one line for each failure."""
 
     def __init__(self, show_failures: bool) -> None:
         self.counts: collections.Counter[str] = collections.Counter()
@@ -76,7 +76,7 @@ class Tally:
 
 
 class SchemeJudge:
-    """Of states and paths, where the scheme promises that nothing crosses."""
+    """Judge of states and paths; silent for schemes whose surfaces may cross."""
 
     def __init__(self, scene: RandomScene) -> None:
         sim = scene.simulator
@@ -90,11 +90,11 @@ class SchemeJudge:
         return self.silent or self._judge.is_free_path(path)
 
     def placed(self, path: np.ndarray) -> np.ndarray:
-        """A path with the meshes of smooth bodies, or of all bodies where they touch with these."""
+        """A path with the meshes of smooth bodies, or of all bodies if meshes are in contact."""
         return path if self.silent else self._judge.placed(path)
 
     def points(self, state: dc.State) -> np.ndarray:
-        """Of all surfaces, as a path has them."""
+        """Points of all surfaces, in the order of a path."""
         return self._judge.points(state)
 
 
@@ -136,7 +136,7 @@ def _run_scene(seed: int, index: int, tally: Tally, drawing: str, where: dict[st
 
 
 def _kind(scene: RandomScene) -> str:
-    """Scheme and coupling, where something that is no cloth moves by forces."""
+    """Label of the scheme, with the coupling if forces also move bodies or robots."""
     sim = scene.simulator
     if sim._layout.is_dynamic:
         return f"{sim.scheme} {sim.coupling}" if sim.scene.cloths else "no cloths"
@@ -144,7 +144,7 @@ def _kind(scene: RandomScene) -> str:
 
 
 def _path(scene: RandomScene, state: dc.State, control: dc.Control) -> np.ndarray | None:
-    """The way of a step; None where it is refused, which the step itself is then asked for."""
+    """Path of a step; None if refused (the step itself then reports the refusal)."""
     try:
         return scene.simulator.path(state, control).numpy()
     except dc.SimulationError:
@@ -159,7 +159,7 @@ def _step(
     tally: Tally,
     where: dict[str, Any],
 ) -> dc.State | None:
-    """The state after a step, with a backward through some; None where it failed."""
+    """State after a step, of which some run backward; None if the step failed."""
     tally.counts["steps"] += 1
     names = ("positions", *(n for n in MOVING if getattr(state, n).numel()))
     wanted = rng.random() < 0.3
@@ -245,7 +245,7 @@ def _judge(
 
 
 def _check_joints(scene: RandomScene, after: dc.State, tally: Tally, where: dict[str, Any]) -> None:
-    """Prescribed joints are where they shall be, others not 1 % of their range beyond limits."""
+    """Check that prescribed joints reach their targets, and others are within limits up to 1 %."""
     if scene.drives is None:
         return
     mechanism = scene.simulator.scene.robots[0].mechanism
@@ -268,7 +268,7 @@ def _check_momentum(
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Internal forces cancel: momentum changes by gravity, air and what bodies push back."""
+    """Internal forces cancel: momentum changes by gravity, air and contact of bodies."""
     if not len(scene.masses):
         return
     m = scene.masses[:, None]
@@ -313,13 +313,13 @@ def _compare(
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Momentum before and after, over the time step, against forces.
+    """Compare momentum before and after, divided by the time step, with forces.
 
-    The error is relative to all of them, and to the force that the solver's tolerance may leave.
+    The error is relative to all forces, including the residual force of the solver's tolerance.
     """
     gain = has - had
     size = sum(np.abs(part).sum() for part in (gain, *forces))
-    size += ROUNDING * (np.abs(had) + np.abs(has)).sum()  # for what flies on as it did
+    size += ROUNDING * (np.abs(had) + np.abs(has)).sum()  # rounding of constant momentum
     size += left / ERROR
     rest = gain.sum(axis=0) - sum(part.sum(axis=0) for part in forces)
     error = np.abs(rest).max() / max(size, 1e-300)
@@ -337,7 +337,7 @@ def _check_gradient(
 ) -> None:
     """Adjoints against differences along a direction in places, velocities and materials."""
     sim = scene.simulator
-    # A share of the speed of a fall: what a solve leaves must vanish beside small differences.
+    # Relative to the speed of a fall: a solve's error must be small against small differences.
     tolerance = 1e-10 * np.sqrt(scene.description["size"])
     tight = dc.Simulator(
         sim.scene,
@@ -363,7 +363,7 @@ def _check_gradient(
     bodies = torch.zeros_like(state.body_poses)
     moves = [body.motion == "dynamic" for body in sim.scene.bodies]
     if any(moves):
-        # And a tenth of a radian, a step; a factor e of the masses.
+        # Changes also include a tenth of a radian per step, and a factor e of the masses.
         turn = torch.tensor([edge] * 3 + [0.1] * 3, dtype=torch.float64) / sim.dt
         noise = torch.from_numpy(rng.normal(size=(len(moves), 6)))
         changes["body_velocities"] = turn * noise * torch.tensor(moves)[:, None]
@@ -371,7 +371,7 @@ def _check_gradient(
         bodies[:, 3:] *= edge
 
     def point(at: float) -> tuple[float, float, float]:
-        """Where, the loss there and its derivative."""
+        """The point `at`, the loss at this point and its derivative."""
         t = torch.tensor(at, dtype=torch.float64, requires_grad=True)
         moved = {name: getattr(state, name) + t * change for name, change in changes.items()}
         physical = {}

@@ -13,14 +13,14 @@ SHARE = 0.4  # of the scenes with cloths
 
 @dataclass(frozen=True)
 class Air:
-    """What is around the cloths of a scene.
+    """Air around the cloths of a scene.
 
     Attributes:
-        normal_drag: Of all cloths [-].
-        tangential_drag: Of all cloths [-].
-        density: [kg/m^3].
-        wind: Before the first step [m/s], shape [3].
-        gust: What comes to it in each step [m/s], shape [3].
+        normal_drag: Drag coefficient of all cloths [-].
+        tangential_drag: Drag coefficient of all cloths [-].
+        density: Density of the air [kg/m^3].
+        wind: Wind before the first step [m/s], shape [3].
+        gust: Increment of the wind in each step [m/s], shape [3].
     """
 
     normal_drag: float = 0.0
@@ -56,7 +56,7 @@ NO_AIR = Air()
 
 
 def draw_air(rng: np.random.Generator, d: dict[str, Any]) -> Air:
-    """None, or some: from a breeze to a storm for cloths of that size."""
+    """No air, or wind between a breeze and a storm for cloths of that size."""
     if rng.random() >= SHARE:
         return NO_AIR
     speed = np.sqrt(9.81 * d["size"])  # of a fall through the cloth's own size

@@ -16,18 +16,18 @@ SHARE = 0.4  # of the scenes with cloths
 
 @dataclass(frozen=True)
 class Pull:
-    """What a control does with an attachment.
+    """Controls of an attachment.
 
     Attributes:
-        name: Of the attachment.
-        weight: Before it is released, in 0 .. 1.
+        name: Name of the attachment.
+        weight: Weight before the release, in 0 .. 1.
         release: Step from which the weight is zero.
-        target: At the start [m], shape [3]; None where both ends are points.
-        velocity: Of the target [m/s], shape [3].
-        rows: Vertices of all cloths that the first end is a sum of.
-        shares: How much of each.
-        stiffness: [N/m].
-        rest_length: [m].
+        target: Target at the start [m], shape [3]; None if both ends are points.
+        velocity: Velocity of the target [m/s], shape [3].
+        rows: Vertices of all cloths whose weighted sum is the first end.
+        shares: Weight of each of these vertices.
+        stiffness: Stiffness [N/m].
+        rest_length: Rest length [m].
     """
 
     name: str
@@ -45,11 +45,11 @@ class Pull:
         return self.weight if k < self.release else 0.0
 
     def target_at(self, k: int, dt: float) -> np.ndarray:
-        """Where it pulls to at the end of step k, [3]."""
+        """Target at the end of step k, [3]."""
         return self.target + (k + 1) * dt * self.velocity
 
     def force(self, positions: np.ndarray, k: int, dt: float) -> np.ndarray:
-        """Of the target on the cloth in step k, by hand [N]."""
+        """Force of the target on the cloth in step k, computed independently [N]."""
         if self.target is None:
             return np.zeros(3)
         way = self.target_at(k, dt) - self.shares @ positions[self.rows]
@@ -73,12 +73,12 @@ def controlled(control: dc.Control, pulls: tuple[Pull, ...], k: int, dt: float) 
 def draw_attachments(
     seed: int, index: int, d: dict[str, Any], scene: dc.Scene
 ) -> tuple[dc.Scene, tuple[Pull, ...]]:
-    """The scene with up to three attachments of its cloths, and what controls do with them.
+    """The scene with up to three attachments of its cloths, and their controls.
 
-    Ends are a vertex of a cloth, or a point of one of its faces, and a target, another vertex or,
-    where one solve moves cloths and bodies, a point of a body.
+    The first end is a vertex of a cloth or a point on one of its faces. The second end is a target,
+    another vertex or, if one solve moves cloths and bodies, a point of a body.
     """
-    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    # A separate random stream keeps all other draws of a scene unchanged.
     rng = np.random.default_rng([seed, index, 2])
     if not scene.cloths or rng.random() >= SHARE:
         return scene, ()

@@ -1,9 +1,9 @@
-"""Random scenes: sizes, materials, bodies, pins and motions over the range that the package is for.
+"""Random scenes: sizes, materials, bodies, pins and motions over the package's intended range.
 
-All that moves by forces here is cloth; see `random_towers` for the rest.
+Forces move only cloth in these scenes; `random_towers` draws bodies and robots moved by forces.
 
-A scene is a function of two integers. What is drawn is plain numbers in a description, from which
-the simulator, the start and the controls are made.
+A scene is a function of two integers. The draws are plain numbers in a description, from which the
+simulator, the start and the controls are made.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ SHAPES: dict[str, Callable[..., dc.RigidBody]] = {
 
 
 def smooth(kind: str, drawn: float) -> dict[str, bool]:
-    """Whether a body is smooth, by a number that is drawn anyway: all else stays what it was."""
+    """Choose if a body is smooth, by a number drawn anyway: all other draws remain unchanged."""
     return {"smooth": drawn > 0} if kind in ("sphere", "capsule") else {}
 
 
 @dataclass(frozen=True)
 class Drives:
-    """What the joints and the base of the only robot shall do.
+    """Controls of the joints and the base of the only robot.
 
     Attributes:
         start: Joint positions at the start [m], shape [J].
-        ends: Where they shall be at the end, shape [J].
-        efforts: At torque and pd joints [N], shape [J].
-        base_velocity: Of a kinematic base, linear [m/s] and angular [rad/s], shape [6].
-        base_wrench: At a floating one [N, N m], shape [6].
+        ends: Joint targets at the end [m], shape [J].
+        efforts: Efforts at torque and pd joints [N], shape [J].
+        base_velocity: Linear [m/s] and angular [rad/s] velocity of a kinematic base, shape [6].
+        base_wrench: Wrench on a floating base [N, N m], shape [6].
     """
 
     start: np.ndarray
@@ -59,19 +59,19 @@ class Drives:
 
 @dataclass(frozen=True)
 class RandomScene:
-    """A scene, its start, and what happens in each step.
+    """A scene, its start, and the controls of each step.
 
     Attributes:
-        description: What was drawn, as plain numbers.
-        simulator: Of the scene.
-        start: With random velocities.
-        steps: How many to take.
+        description: The draws, as plain numbers.
+        simulator: Simulator of the scene.
+        start: Start state, with random velocities.
+        steps: Number of steps.
         body_velocities: Linear [m/s] and angular [rad/s] velocity of each body, shape [K, 6].
-        pin_velocity: Of the pins [m/s], shape [3].
-        masses: Of the cloth vertices [kg].
-        drives: Of the robot, if there is one.
-        pulls: What controls do with attachments.
-        air: What is around the cloths.
+        pin_velocity: Velocity of the pins [m/s], shape [3].
+        masses: Masses of the cloth vertices [kg].
+        drives: Controls of the robot, if there is one.
+        pulls: Controls of the attachments.
+        air: Air around the cloths.
     """
 
     description: dict[str, Any]
@@ -86,7 +86,7 @@ class RandomScene:
     air: Air = NO_AIR
 
     def control(self, state: dc.State, k: int) -> dc.Control:
-        """Of step k."""
+        """Control of step k."""
         dt = self.simulator.dt
         poses = state.body_poses.detach().clone()
         for pose, velocity in zip(poses, self.body_velocities, strict=True):
@@ -117,7 +117,7 @@ class RandomScene:
 
 
 def _moved(pose: torch.Tensor, way: np.ndarray) -> torch.Tensor:
-    """A pose [7] after a shift and a turn in the world [6]; the same bits where there is none."""
+    """A pose [7] after a shift and a rotation in the world [6]; unchanged bits for zero motion."""
     if not way.any():
         return pose
     moved = pose.clone()
@@ -150,7 +150,7 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
         "gravity": maybe(rng, 0.9, G),
         "steps": int(rng.integers(3, 7)),
     }
-    # Numbers of their own, as those of attachments: scenes are otherwise what they were before.
+    # A separate random stream, as for attachments, keeps all other draws of a scene unchanged.
     air = draw_air(np.random.default_rng([seed, index, 3]), d)
     cloths, clearance = draw_cloths(rng, d, air)
     bodies, velocities = draw_bodies(rng, d, clearance)
@@ -174,9 +174,9 @@ def draw_throw(
     pin_speed: float,
     **options: Any,
 ) -> RandomScene:
-    """A scene whose cloths start with random velocities, and whose pins move at times."""
+    """A scene whose cloths start with random velocities and whose pins sometimes move."""
     start = simulator.initial_state()
-    speed = float(np.sqrt(G * d["size"]))  # of a fall through the cloth's own size
+    speed = float(np.sqrt(G * d["size"]))  # speed of a fall through the cloth's own size
     d["speed"] = speed * rng.uniform(0, 2)
     d["noise"] = speed * log_uniform(rng, 1e-3, 1.0)
     drift = rng.normal(size=3)
@@ -235,7 +235,7 @@ def draw_cloths(
     flat = np.array(grid.vertices)
     flat[:, :2] += d["jitter"] * edge * rng.uniform(-1, 1, (len(flat), 2))
     clearance = edge * rng.uniform(0.11, 0.5)
-    # Numbers of their own: scenes are otherwise what they were before there was woven cloth.
+    # A separate random stream for woven cloth keeps all other draws of a scene unchanged.
     of_weave = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])
     material = _woven(of_weave, _material(rng, edge, air))
     d["material"] = {k: getattr(material, k) for k in material.__dataclass_fields__}
@@ -309,7 +309,7 @@ def _tilted(flat: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
 def draw_bodies(
     rng: np.random.Generator, d: dict[str, Any], clearance: float
 ) -> tuple[list[dc.RigidBody], np.ndarray]:
-    """One or two bodies below z = 0, standing still or moving."""
+    """One or two static or moving bodies below z = 0."""
     size = d["size"]
     kinds = [str(rng.choice(BODIES))]
     if rng.random() < 0.3:

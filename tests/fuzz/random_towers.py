@@ -1,7 +1,7 @@
 """Random towers: bodies and robots that forces move, above, below and between cloths, or alone.
 
-Everything stands over the next with a gap, whatever its shape and turn: so nothing overlaps at the
-start, and what falls, is thrown or is driven meets in a few steps.
+Objects of any shape and orientation are stacked with gaps. Nothing overlaps at the start, and
+falling, thrown or driven objects meet within a few steps.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ ROUND_GRIPPER = Path(__file__).resolve().parents[1] / "data" / "round_gripper.ur
 
 
 class Tower:
-    """Puts things over and under a slab that is taken, each with a gap to the one before."""
+    """Places objects above and below an occupied slab, each with a gap to the previous one."""
 
     def __init__(self, low: float, high: float, gap: float) -> None:
         self._ends, self._gap = {-1: low, 1: high}, gap
 
     def place(self, rng: np.random.Generator, vertices: np.ndarray, side: int) -> float:
-        """Height of the origin of what has these vertices about it, over (1) or under (-1) all."""
+        """Height of an object's origin, above (1) or below (-1) all others, from its vertices."""
         near, far = vertices[:, 2].min(), vertices[:, 2].max()
         if side < 0:
             near, far = far, near
@@ -59,7 +59,7 @@ class Tower:
 def draw_tower(seed: int, index: int) -> RandomScene:
     rng = np.random.default_rng([seed, index])
     has_cloths, has_robot = rng.random() < 0.75, rng.random() < 0.35
-    # The gripper has a size of its own.
+    # The gripper has a fixed size.
     size = log_uniform(rng, 0.05, 0.25) if has_robot else log_uniform(rng, 5e-3, 10.0)
     d: dict[str, Any] = {
         "size": size,
@@ -73,7 +73,7 @@ def draw_tower(seed: int, index: int) -> RandomScene:
         "steps": int(rng.integers(3, 7)),
     }
     _choose_scheme(rng, d, has_cloths)
-    # Numbers of their own, as those of attachments: scenes are otherwise what they were before.
+    # A separate random stream, as for attachments, keeps all other draws of a scene unchanged.
     air = draw_air(np.random.default_rng([seed, index, 3]), d) if has_cloths else NO_AIR
     cloths, clearance = [], 0.03 * size
     if has_cloths:
@@ -94,7 +94,7 @@ def draw_tower(seed: int, index: int) -> RandomScene:
         if has_robot:
             robots, drives, held = _gripper(rng, d, tower, kinds)
             bodies += held
-        # What is prescribed comes last, at the bottom.
+        # Prescribed bodies come last, at the bottom.
         for _ in range(int(rng.random() < 0.7)):
             bodies.append(_prescribed(rng, d, tower, kinds))
         velocities = np.array([_velocity(rng, d, body) for body in bodies])
@@ -124,7 +124,7 @@ def draw_tower(seed: int, index: int) -> RandomScene:
 
 
 def _choose_scheme(rng: np.random.Generator, d: dict[str, Any], has_cloths: bool) -> None:
-    """A scheme with what it takes: `split` needs a staggered coupling, `projective` cloths."""
+    """Choose a scheme and its options: `split` needs a staggered coupling, `projective` cloths."""
     d["coupling"] = str(rng.choice(COUPLINGS, p=[0.5, 0.25, 0.25]))
     d["scheme"], d["metric"], d["elastic"] = "coupled", None, "newton"
     kind = rng.random()
@@ -159,7 +159,7 @@ def _body(
     size: float | None = None,
     at: np.ndarray | None = None,
 ) -> dc.RigidBody:
-    """One that forces move, over or under what is there, or at a given place."""
+    """A dynamic body above or below the tower, or at a given place."""
     kind = str(rng.choice([name for name in BODIES if name != "plane"]))
     s = d["size"] * rng.uniform(0.1, 0.5) if size is None else size
     if cloth_mass and rng.random() < 0.5:
@@ -202,9 +202,9 @@ def _prescribed(
 def _gripper(
     rng: np.random.Generator, d: dict[str, Any], tower: Tower, kinds: list[str]
 ) -> tuple[list[dc.Robot], Drives, list[dc.RigidBody]]:
-    """The package's gripper, turned any way, and now and then a body between its fingers.
+    """The package's gripper in a random orientation, sometimes with a body between its fingers.
 
-    In half of the scenes round tips are added to its fingers.
+    In half of the scenes the fingers have additional round tips.
     """
     base = str(rng.choice(BASES))
     modes = [str(mode) for mode in rng.choice(MODES, 2)]
@@ -224,7 +224,7 @@ def _gripper(
         "friction": maybe(rng, 0.8, rng.uniform(0.1, 1.2)),
         "name": "hand",
     }
-    bounds = _bounds(*rng.spawn(1))  # other draws stay what they are
+    bounds = _bounds(*rng.spawn(1))  # other draws remain unchanged
     options |= bounds
     file, round_tips = dc.robots.GRIPPER, bool(q[2] > 0)
     if round_tips:
@@ -243,7 +243,7 @@ def _gripper(
     hand = dc.Robot.load(file, pose=[*at, *q], **options)
     held = []
     if hold:
-        # Its half diagonal is below the half opening of the fingers.
+        # The body's half diagonal is below half of the fingers' opening.
         middle = at + _rotated(np.array([0.0, 0.0, 0.056]), q)
         size = rng.uniform(0.01, 0.024)
         held.append(_body(rng, d, tower, 0.0, kinds, size=size, at=middle))
@@ -267,7 +267,7 @@ def _gripper(
 
 
 def _bounds(rng: np.random.Generator) -> dict[str, Any]:
-    """What the fingers can do and what resists them, now and then."""
+    """Random limits and friction of the fingers, absent in some scenes."""
     ends = {
         "effort_limits": (0.1, 30.0),
         "velocity_limits": (0.02, 2.0),
@@ -278,7 +278,7 @@ def _bounds(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _velocity(rng: np.random.Generator, d: dict[str, Any], body: dc.RigidBody) -> np.ndarray:
-    """Towards the middle of the tower, and any way; a turn of some tenths of a radian a step."""
+    """Velocity towards the tower's middle plus noise; a spin of some 0.1 rad per step."""
     if body.motion == "static":
         return np.zeros(6)
     speed = np.sqrt(G * d["size"])

@@ -61,7 +61,7 @@ def test_texture_coordinates_are_the_rest_shape(write):
 
 
 def test_a_larger_cut_hangs_lower(write):
-    """A flag whose texture says that it is 5 % larger than its mesh."""
+    """A flag whose texture coordinates are 5 % larger than its mesh."""
     flag = dc.Cloth.grid((5, 5), 0.2)
     path = write(textured(flag, flag.vertices[:, :2]))
     lengths = []
@@ -187,7 +187,7 @@ def test_polygons_are_covered_once(count):
 
 @pytest.mark.parametrize("first", range(4))
 def test_doubled_corners_of_a_polygon_are_cut_off(write, first):
-    """The flat triangle keeps its edges in pairs; a body drops it, and a cloth refuses it."""
+    """The flat triangle keeps its edges in pairs; a body drops the triangle, a cloth refuses it."""
     quad = " ".join(np.roll(["1", "2", "3", "4"], -first))
     path = write(f"v 0 0 0\nv 1 0 0\nv 1 0 0\nv 0 1 0\nf {quad}\n")
     with pytest.warns(UserWarning, match="dropped 1 of 2 faces: 1 without area, 0 with"):

@@ -26,7 +26,7 @@ def test_a_box_has_the_inertia_of_the_textbook(segments):
 
 
 def test_a_far_and_turned_mesh_has_the_same_moments():
-    """About the center nothing but axes changes: rounding grows with the distance alone."""
+    """About the center only the axes change; rounding grows only with the distance."""
     vertices, faces = shapes.capsule(0.2, 0.5)
     volume, center, inertia = mass_properties(vertices, faces)
     far = np.array([100.0, -200.0, 300.0])
@@ -120,7 +120,7 @@ def test_a_dynamic_body_is_filled_evenly():
     assert by_mass.mass == 200 * volume  # to the bit
 
 
-def test_what_is_given_is_taken():
+def test_given_mass_properties_are_kept():
     center, inertia = [0.1, 0, 0], np.diag([1.0, 2, 2])
     body = dynamic(mass=3, center=center, inertia=inertia)
     assert body.mass == 3
@@ -136,7 +136,7 @@ def test_what_is_given_is_taken():
     assert inward.mass == 3
 
 
-def test_what_does_not_move_by_forces_has_no_mass():
+def test_bodies_that_no_force_moves_have_no_mass():
     body = dc.RigidBody.box(1.0, motion="kinematic")
     assert body.mass == 0
     assert not body.center.any()
@@ -207,7 +207,7 @@ def test_bad_mass_properties_are_refused(make, error, message):
 
 
 def _flat(height):
-    """A closed tetrahedron of next to no height."""
+    """A closed tetrahedron of nearly zero height."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, height]])
     return vertices, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 

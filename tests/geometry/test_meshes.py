@@ -163,7 +163,7 @@ def test_public_meshes_are_read_as_trimesh_reads_them(name, counts):
     vertices, faces = read_mesh(public(name))
     reference = trimesh.load_mesh(public(name), process=False, maintain_order=True)
     assert len(vertices) == counts
-    np.testing.assert_allclose(vertices, reference.vertices, rtol=1e-7)  # float32 in one of them
+    np.testing.assert_allclose(vertices, reference.vertices, rtol=1e-7)  # one file has float32
     np.testing.assert_array_equal(faces, reference.faces)
 
 
@@ -277,7 +277,7 @@ def test_bodies_may_have_unreferenced_vertices_but_no_flat_faces():
 def test_useless_faces_of_a_body_are_dropped_with_a_warning():
     """The rest is the body: its solid is closed by the faces that are dropped."""
     box = dc.RigidBody.box(1.0)
-    # Face 0 becomes two, one of them on an edge, where a vertex more is.
+    # Face 0 becomes two faces that share an extra vertex on an edge.
     a, b, c = box.faces[0].tolist()
     middle = len(box.vertices)
     vertices = np.concatenate([box.vertices, box.vertices[[a, b]].mean(axis=0)[None]])
@@ -386,7 +386,7 @@ COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" versi
 
 
 def test_the_unit_of_a_collada_file_applies_and_its_up_axis_does_not(tmp_path):
-    """Faults of what is beside the meshes do not matter: a texture and a camera are missing."""
+    """Faults beside the meshes have no effect: a texture and a camera are missing."""
     pytest.importorskip("collada")
     path = tmp_path / "a.dae"
     for unit in (1.0, 0.001):

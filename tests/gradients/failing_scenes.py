@@ -1,8 +1,8 @@
-"""Scenes in which one of eight environments fails, mostly as its motion cannot be completed.
+"""Scenes in which one of eight environments fails, mostly because of an infeasible motion.
 
-A loose or pinned sheet gets between something that moves and something that stands still; a ball
-that falls beside it gives every coupling something to do. Or forces crumple the sheet in more
-iterations than there are.
+A loose or pinned sheet is squeezed between a moving object and a static one; a ball that falls
+beside the sheet involves every coupling. Or forces crumple the sheet, which requires more
+iterations than allowed.
 """
 
 import math
@@ -16,7 +16,7 @@ F64 = torch.float64
 B, FAILED, DT = 8, 5, 0.01
 FLAT = [1.0, 0.0, 0.0, 0.0]
 
-# What moves -> name of the control.
+# Moving object -> name of the control.
 KINDS = {
     "pins": "pins",
     "body": "body_poses",
@@ -29,14 +29,14 @@ BLOCKED = [kind for kind in KINDS if kind != "forces"]
 
 
 def status(kind, scheme="coupled", coupling="monolithic"):
-    """What the report says of each environment."""
-    # The elastic stage of "split" leaves no iteration to move the ball with.
+    """Status of each environment in the report."""
+    # The elastic stage of "split" leaves no iteration to move the ball.
     is_blocked = kind in BLOCKED or (scheme, coupling) == ("split", "rigid_to_cloth")
     failure = "infeasible_motion" if is_blocked else "not_converged"
     return tuple(failure if i == FAILED else "converged" for i in range(B))
 
 
-# Scheme and coupling; the first without anything that forces move.
+# Scheme and coupling; forces move no body in the first.
 SOLVES = [
     ("split", "monolithic"),
     ("coupled", "monolithic"),
@@ -103,7 +103,7 @@ def simulator(kind, scheme="coupled", coupling="monolithic", **solver):
 
 
 def targets(kind, sim):
-    """Where things shall be at the end of a step, [B, ...]: too far in one environment."""
+    """Prescribed targets at the end of a step, [B, ...]: too far in one environment."""
     state = sim.initial_state(B)
     small = 1e-3 * torch.linspace(0.2, 1.0, B, dtype=F64)
     if kind == "pins":

@@ -1,4 +1,4 @@
-"""Gradients through attachments, in every scheme and coupling that takes them."""
+"""Gradients through attachments, in every scheme and coupling that supports attachments."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def picked(**options):
 
 
 def sewn(**options):
-    """Two sheets, one of them held, seamed at vertices and at a point of a face."""
+    """Two sheets seamed at vertices and at a point of a face; one sheet is held."""
     cloths = [sheet("left", [0, 0, 0], 0), sheet("right", [0.45, 0.02, 0.05], 3)]
     attachments = [
         dc.Attachment(("left", [3, 7, 11]), ("right", [0, 4, 8]), stiffness=60.0, name="seam"),
@@ -189,7 +189,7 @@ PICKER = dc.Attachment(("box", [0.05, 0.0, 0.1]), stiffness=50.0, name="picker")
 
 
 def hanging_at_free_box():
-    """A sheet that hangs at a free box, sewn to it at three points, one with a rest length."""
+    """A sheet sewn to a free box at three points, one of which has a rest length."""
     attachments = [
         dc.Attachment(
             ("sheet", [5, 6]), ("box", [[0.03, 0.04, -0.1], [0, 0, -0.3]]), stiffness=70.0
@@ -202,7 +202,7 @@ def hanging_at_free_box():
 
 
 def free_box_alone():
-    """Nothing can touch: all forces on the body are those of its attachment."""
+    """Without possible contact, all forces on the body come from its attachment."""
     scene = dc.Scene([], [free_box()], gravity=(0.4, -0.3, -9.81), attachments=[PICKER])
     sim = dc.Simulator(scene, scenes.DT, solver=dc.SolverOptions(tolerance=scenes.TOLERANCE))
     return sim, torch.tensor([0.7], dtype=F64)
@@ -222,7 +222,7 @@ def test_a_free_body_has_gradients_by_everything(make):
     inputs["body_mass"] = sim.default_parameters().body_mass
     inputs = {name: tensor for name, tensor in inputs.items() if tensor.numel()}
     outputs = ("positions", "velocities", "body_poses", "body_velocities", "body_forces")
-    # Forces alone, too: their gradient is not that of positions.
+    # The second loss has forces only; their gradient differs from the gradient of positions.
     for scale in ((1.0, 0.01, 1.0, 0.01, 0.001), (0.0, 0.0, 0.0, 0.0, 1.0)):
 
         def step(values):
@@ -300,7 +300,7 @@ ROBOTS = {
 
 @pytest.mark.parametrize("kind", ROBOTS)
 def test_links_have_gradients(kind):
-    """Points of two links of a gripper whose joints are prescribed or move by forces."""
+    """Points on two links of a gripper with prescribed or force-driven joints."""
     hand = dc.Robot.load(
         dc.robots.GRIPPER,
         pose=[0, 0, 0.4, 1, 0.1, 0.2, 0.3],
@@ -336,7 +336,7 @@ def test_links_have_gradients(kind):
 
 @pytest.mark.parametrize("make", [sewn, held])
 def test_the_energy_has_the_gradients_of_springs(make):
-    """By positions, poses and stiffness, where all springs between points pull with weight one."""
+    """By positions, poses and stiffness, with all springs between points at weight one."""
     case = make()
     state, parameters = case.state, case.sim.default_parameters()
     inputs = {

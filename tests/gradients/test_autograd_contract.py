@@ -1,4 +1,4 @@
-"""What autograd promises around a step in contact: saved tensors, batches, dtypes, equal bits.
+"""The contract of autograd for a step in contact: saved tensors, batches, dtypes, equal bits.
 
 `test_contract` checks the same promises of the interface in free flight; here contact, friction
 iterations and the factors kept for backward take part.
@@ -115,15 +115,15 @@ def test_only_what_is_needed_is_computed(coupled, monkeypatch):
     assert [k for k, t in values.items() if t.grad is not None] == ["state.velocities"]
 
 
-def test_one_input_alone_gets_the_gradient_of_all_together(case):
+def test_a_single_input_gets_the_gradient_of_all_inputs(case):
     together = gradients(case, leaves(case))
     for name in together:
         assert_same(gradients(case, leaves(case, (name,))), {name: together[name]})
 
 
 @pytest.mark.parametrize("name", ["parameters.friction", "parameters.slip_velocity"])
-def test_what_friction_is_made_of_gets_its_gradient_alone_too(name):
-    """Where a sheet sticks the slip counts; where it slides its gradient is zero."""
+def test_a_single_friction_parameter_gets_its_gradient(name):
+    """The slip velocity counts if a sheet sticks; its gradient is zero if the sheet slides."""
     case = scenes.regime("sticking")
     together = gradients(case, leaves(case))[name]
     assert together.any()
@@ -143,7 +143,7 @@ def test_an_unused_output_has_no_part(coupled):
 
 
 def transposed(tensor):
-    """The same numbers in another order in memory."""
+    """An equal tensor with another memory layout."""
     if tensor.dim() < 2:
         return torch.stack([tensor, tensor], dim=-1)[..., 0]
     return tensor.transpose(0, 1).contiguous().transpose(0, 1)
@@ -158,7 +158,7 @@ def test_layout_changes_no_bit(case):
 
 
 def test_expanded_inputs_sum_their_gradients(coupled):
-    """One force on all vertices, one friction for all pairs, are views of one number."""
+    """One force for all vertices and one friction for all pairs are expanded views."""
     shape = coupled.state.positions.shape
     force = torch.tensor([1e-3, 2e-3, -1e-3], dtype=F64, requires_grad=True)
     friction = torch.tensor(0.6, dtype=F64, requires_grad=True)
@@ -208,7 +208,7 @@ def three_states(case):
 
 
 def batch_inputs(case):
-    """States, stacked, and what they share."""
+    """Stacked states, and their shared inputs."""
     stacked = dc.stack(three_states(case))
     shared = {k: t for k, t in leaves(case).items() if not k.startswith("state.")}
     return stacked, shared
@@ -323,7 +323,7 @@ def test_a_step_that_did_not_converge_has_no_gradient(coupled):
     assert values["state.positions"].grad is None
 
 
-def test_one_unconverged_environment_refuses_for_its_batch():
+def test_an_unconverged_environment_refuses_for_its_batch():
     """A sheet that falls freely needs one iteration, one that vibrates more."""
     vertices, faces = scenes.grid(4, 4)
     sim = dc.Simulator(

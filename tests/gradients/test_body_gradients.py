@@ -16,12 +16,12 @@ GAP = 0.006  # of the barrier's 0.01
 
 
 def triangle():
-    """One triangle below some of the sheet: an edge and a corner of it stick into the cloth."""
+    """One triangle below a part of the sheet; an edge and a corner of it press into the cloth."""
     return np.array([[-0.21, -0.16, 0], [0.24, -0.05, 0.002], [0.03, 0.23, 0]]), [[0, 1, 2]]
 
 
 def terrain():
-    """An open sheet with hills and hollows, finer than the cloth, that ends below it."""
+    """An open sheet with hills and hollows, finer than the cloth, whose border is below it."""
     vertices, faces = scenes.grid(7, 7, edge=0.05, seed=4)
     center = vertices.mean(axis=0)
     bumps = 0.002 * np.random.default_rng(5).uniform(-1, 1, len(vertices))
@@ -61,7 +61,7 @@ def smooth_ball(**keywords):
 
 
 def smooth_capsule(**keywords):
-    """Lying aslant below the sheet, one end of it below its middle."""
+    """An oblique capsule below the sheet, one end of which is below the sheet's middle."""
     axis = np.array([0.3, 0.7, 0.02]) / np.linalg.norm([0.3, 0.7, 0.02])
     turn = Rotation.align_vectors([axis], [[0, 0, 1]])[0].as_quat()[[3, 0, 1, 2]]
     at = np.array([0.02, 0.03, -0.4]) - 0.15 * axis
@@ -102,7 +102,7 @@ def resting(name, *, moving=False, friction_iterations=2, **options):
     )
     state = state.replace(velocities=velocity)
     state = scenes.settled(sim, state, 2)
-    # In air at rest, drag is so little that differences would not show it.
+    # In air at rest, drag is too small for difference quotients.
     control = {"wind": scenes.WIND}
     if moving:
         poses = state.body_poses.clone()
@@ -113,7 +113,7 @@ def resting(name, *, moving=False, friction_iterations=2, **options):
 
 
 def without_slip(case):
-    """The law of sliding does not know where sliding begins."""
+    """Inputs with zero gradient: sliding friction does not depend on the slip velocity."""
     slip = gradients(case, make_loss(case))["parameters.slip_velocity"]
     return () if slip.any() else ("parameters.slip_velocity",)
 
@@ -135,13 +135,13 @@ def test_every_gradient_is_that_of_the_step(name, moving):
 
 @pytest.mark.quick("triangle")
 @pytest.mark.parametrize("name", ["triangle", "dented", "smooth_capsule"])
-def test_split_steps_too(name):
+def test_every_gradient_of_a_split_step_matches_differences(name):
     case = resting(name, moving=True, scheme="split")
     check(case, CONTACT, zero=without_slip(case))
 
 
 def test_some_contacts_have_negative_weights():
-    """Otherwise the terrain would prove nothing about them."""
+    """Premise: the terrain tests negative weights only if there are some."""
     case = resting("terrain")
     x = np.concatenate([case.step().positions.numpy(), case.sim.scene.bodies[0].vertices])
     cloth, body = case.sim.scene.cloths[0], case.sim.scene.bodies[0]

@@ -73,7 +73,7 @@ def check_gradients(run, inputs, directions, state):
 
 @pytest.mark.parametrize(("package", "name"), ROBOTS)
 def test_gradients_through_what_a_robot_carries(package, name):
-    """By targets of all joints, the pose of the base and friction, over four steps in contact."""
+    """Gradients by joint targets, base pose and friction, over four steps in contact."""
     path = robot_file(package, name)
     robot, span = inside_its_limits(path, base="kinematic", actuation="position")
     simulator = carrying(robot)
@@ -104,7 +104,7 @@ def test_gradients_through_what_a_robot_carries(package, name):
 
 @pytest.mark.parametrize(("package", "name"), DRIVEN)
 def test_gradients_through_drives_that_carry(package, name):
-    """By targets and gains of the drives, and efforts beside them; forces move all joints."""
+    """Gradients by targets, gains and feed-forward efforts of drives; forces move all joints."""
     robot, span = inside_its_limits(robot_file(package, name), stiffness=50.0, damping=5.0)
     simulator = carrying(robot)
     start, given = simulator.initial_state(), simulator.default_parameters()

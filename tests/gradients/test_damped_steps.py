@@ -1,4 +1,4 @@
-"""What a simulator keeps of damped cloth, whose damping has numbers of one step alone."""
+"""Cached data of damped cloth, whose damping depends on the start of one step."""
 
 import pytest
 import torch

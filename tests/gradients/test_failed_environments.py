@@ -1,4 +1,4 @@
-"""A batch with environments that failed: the others keep their states and gradients, to the bit."""
+"""Batches with failed environments: the others keep the bits of their states and gradients."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ FAILED = 1  # of three environments
 
 
 def falling(**solver):
-    """A sheet above a floor that one environment reaches at once, with too few iterations."""
+    """A sheet above a floor; one environment lands at once and has too few iterations."""
     vertices, faces = scenes.grid(5, 5)
     cloth = dc.Cloth(vertices + np.array([0.0, 0.0, 0.02]), faces)
     floor = dc.RigidBody.plane(2.0, motion="kinematic")

@@ -1,4 +1,4 @@
-"""One of eight environments fails: its state, its gradient, and the others."""
+"""One of eight environments fails: its state and gradient, and the other environments."""
 
 import failing_scenes
 import pytest
@@ -114,7 +114,7 @@ def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, s
     assert judge.is_free(after)
     path = solver_path(sim, start, control(kind, wanted))
     assert judge.is_free_path(path)
-    # Difference quotients, of what is where it is.
+    # Velocities are difference quotients of the actual positions.
     torch.testing.assert_close(
         after.velocities, (after.positions - start.positions) / DT, rtol=0, atol=1e-12
     )
@@ -143,7 +143,7 @@ def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, s
     if kind == "joint":
         torch.testing.assert_close(after.joint_velocities[0], last / DT)
     if kind in ("turning body", "base"):
-        # The same share of the way and of the turn.
+        # Translation and rotation end at the same fraction.
         place = torch.lerp(first[:3], wanted[:3], fraction)
         torch.testing.assert_close(last[:3], place, rtol=0, atol=1e-12)
         assert abs(last[3:].norm() - 1) < 1e-12
@@ -151,12 +151,12 @@ def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, s
         torch.testing.assert_close(angles[0], fraction * angles[1], rtol=1e-9, atol=1e-9)
         rates = after.base_velocities[0] if kind == "base" else after.body_velocities[1]
         torch.testing.assert_close(rates[3:].norm(), angles[0] / DT)
-    # What holds goes on from there.
+    # Holding the controls continues from the state.
     assert sim.step(after.detach()).report.motion_fraction == 1
 
 
 @by_kind
-def test_a_loss_that_depends_on_it_raises_its_error(kind):
+def test_a_loss_of_a_failed_environment_raises_its_error(kind):
     sim = simulator(kind)
     after, leaves = step(kind, sim, sim.initial_state(B), targets(kind, sim))
     error, how = dc.InfeasibleMotion, "complete"
@@ -224,7 +224,7 @@ def test_rollouts_with_and_without_checkpoints_agree(kind, scheme, coupling):
         wanted = targets(kind, sim).requires_grad_()
         x = sim.initial_state(B).positions.clone().requires_grad_()
         state, states = sim.initial_state(B).replace(positions=x), []
-        after = [None, None] if kind == "pins" else []  # what is squeezed is slow to solve
+        after = [None, None] if kind == "pins" else []  # squeezed cloth is slow to solve
         controls = [None, control(kind, wanted), *after]
         states = sim.rollout(state, controls, checkpoint_every=every)
         assert states[1].report.status == status(kind, scheme, coupling)
@@ -244,7 +244,7 @@ def test_rollouts_with_and_without_checkpoints_agree(kind, scheme, coupling):
 
 
 @by_block
-def test_it_raises_by_default(kind):
+def test_a_failure_raises_by_default(kind):
     sim = simulator(kind, throw=True)
     with pytest.raises(dc.InfeasibleMotion, match=rf"environments \[{FAILED}\]") as caught:
         sim.step(sim.initial_state(B), control(kind, targets(kind, sim)))
@@ -276,8 +276,8 @@ def test_an_intersecting_state_raises_in_any_case():
     assert caught.value.report.status[2] == "intersecting_state"
 
 
-def test_each_environment_has_its_own_error():
-    """One runs out of iterations, another is squeezed, the rest is free."""
+def test_environments_have_separate_errors():
+    """One environment runs out of iterations, another is squeezed, the others are free."""
     sim = failing_scenes.simulator("body", max_iterations=30)
     state = sim.initial_state(B)
     poses = targets("body", sim)

@@ -11,13 +11,14 @@ import diffcloth_torch as dc
 
 F64 = torch.float64
 SCHEMES = [("coupled", None), ("split", "energy"), ("split", "mass"), ("split", "elastic")]
-# Their springs pull where the positions are; in "mass" and "elastic" where the elastic stage ends.
+# Springs act at the final positions in these schemes; in "mass" and "elastic", at the end of the
+# elastic stage.
 WITH_SPRINGS = SCHEMES[:2]
 WITHOUT_SOFT_PINS = ("folded", "folded_thick", "sphere")
 
 
 def spring_forces(case, after):
-    """Of the soft pins on their vertices, [Q, 3] N."""
+    """Forces of the soft pins on their vertices [N], shape [Q, 3]."""
     sim = case.sim
     soft = torch.from_numpy(sim._assembly.soft_pins.astype(np.int64))
     stiffness = case.inputs().get("parameters.pin_stiffness", torch.zeros(1, dtype=F64))
@@ -36,7 +37,7 @@ def balances():
 
 @pytest.mark.parametrize(("name", "scheme", "metric"), list(balances()))
 def test_forces_change_the_momentum(name, scheme, metric):
-    """In a vacuum; tests/physics/test_air.py and the fuzz count what air does."""
+    """In a vacuum; tests/physics/test_air.py and the fuzz test include air."""
     case = scenes.regime(name, scheme, metric)
     case = case.where(parameters={**case.parameters, "air_density": torch.zeros((), dtype=F64)})
     after, tensors, sim = case.step(), case.inputs(), case.sim
@@ -52,7 +53,7 @@ def test_forces_change_the_momentum(name, scheme, metric):
         parts.append(tensors["control.forces"])
     total = sum(part.sum(0) for part in parts)
     size = sum(float(part.abs().sum()) for part in parts)
-    # What the solver leaves is below its tolerance, as a velocity.
+    # The solver's residual, as a velocity, is below its tolerance.
     assert (change - total).abs().max() < 1e-9 * size
 
 
@@ -147,7 +148,7 @@ def test_gradients_of_forces_with_a_body_that_they_move(coupling):
     for name, (tensor, size) in inputs.items():
         leaf = tensor.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(loss(name, leaf), leaf)
-        # In turn, the box falls as if there were no cloth.
+        # In `rigid_to_cloth` the box's solve does not depend on the cloth, nor on its own mass.
         assert gradient.any() or (name == "body_mass" and coupling == "rigid_to_cloth")
         for d in directions(tensor, generator):
 

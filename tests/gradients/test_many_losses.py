@@ -1,6 +1,6 @@
 """Several losses in one backward: the gradients of a loop over them, to the bit.
 
-Seven losses are more than one pass over a factor takes, so that a step is pulled back in portions.
+Seven losses exceed one pass over a factor, so backward processes a step in portions.
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ def assert_same(found, expected, names):
 
 
 def taken(case):
-    """Outputs of a step and its leaves: all inputs but those that the control replaces."""
+    """Outputs of a step, and its leaves: all inputs that the control does not replace."""
     replaced = {"state.soft_pin_targets"} if "soft_pins" in case.control else set()
     values = {name: t for name, t in case.inputs().items() if name not in replaced}
     leaves = {name: t.clone().requires_grad_() for name, t in values.items()}
@@ -62,7 +62,7 @@ def test_every_input_gets_the_gradients_of_a_loop(name, scheme):
 
 
 @pytest.mark.parametrize("names", [["state.velocities"], ["parameters.friction"]])
-def test_one_input_alone_gets_the_gradients_of_a_loop(names):
+def test_a_single_input_gets_the_gradients_of_a_loop(names):
     outputs, leaves = taken(scenes.regime("pinned"))
     cotangents = random_cotangents(outputs)
     values = [leaves[name] for name in names]
@@ -72,7 +72,7 @@ def test_one_input_alone_gets_the_gradients_of_a_loop(names):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_gets_the_gradients_of_a_loop(scheme):
-    """Environments share parameters, and two of the losses depend on one environment alone."""
+    """Environments share parameters, and two losses depend on a single environment."""
     vertices, faces = scenes.grid(5, 5)
     ball = dc.RigidBody.sphere(0.05, pose=[0, 0, -0.053, 1, 0, 0, 0])
     scene = dc.Scene([dc.Cloth(vertices, faces, pins={"a": [0]})], [ball])
@@ -137,7 +137,7 @@ def test_rollouts_with_bodies_and_robots_get_the_gradients_of_a_loop(coupling, c
     values = list(leaves.values())
     found = at_once(outputs, values, cotangents)
     for name, a, b in zip(leaves, found, in_a_loop(outputs, values, cotangents), strict=True):
-        # What torch does around a step adds products of matrices up in an order of its own.
+        # Torch operations around a step sum matrix products in another order.
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12 * float(b.abs().max()), msg=name)
 
 
@@ -175,7 +175,7 @@ def test_vmap_over_backward_is_the_loop():
     folded = [c.reshape(2, 3, *c.shape[1:]) for c in cotangents]
     nested = torch.vmap(torch.vmap(pull_back))(*folded)
     assert_same([t.flatten(0, 1) for t in nested], expected, leaves)
-    # One cotangent that all losses share.
+    # All losses share one cotangent.
     shared = [cotangents[0][0], *cotangents[1:]]
     found = torch.vmap(pull_back, in_dims=(None, 0, 0))(*shared)
     spread = [shared[0].expand_as(cotangents[0]), *cotangents[1:]]

@@ -1,4 +1,4 @@
-"""Steps with contact at nodes whose pins are tied to other vertices by springs and by the air."""
+"""Steps with nodal contact, with pins coupled to other vertices by springs and by air drag."""
 
 import pytest
 import torch

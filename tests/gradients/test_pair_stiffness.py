@@ -24,7 +24,7 @@ SCHEMES = [("coupled", None), ("split", "mass"), ("split", "elastic")]
 
 @cache
 def case(scheme, metric, iterations):
-    """The lower sheet lies on two boxes, and carries the upper one, which slides on it."""
+    """The lower sheet lies on two boxes and carries the upper sheet, which slides on it."""
     lower, faces = scenes.grid(6, 6, seed=3)
     upper, upper_faces = scenes.grid(4, 4, seed=5)
     lower, upper = lower - lower.mean(axis=0), upper - upper.mean(axis=0)
@@ -56,7 +56,7 @@ def case(scheme, metric, iterations):
 
 @pytest.mark.parametrize("iterations", [1, 2])
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["coupled", "split-mass", "split-elastic"])
-def test_each_entry_has_its_gradient(scheme, iterations):
+def test_every_entry_of_the_stiffness_has_its_gradient(scheme, iterations):
     given = case(*scheme, iterations)
     loss = make_loss(given)
     found = gradients(given, loss)[NAME]
@@ -87,7 +87,7 @@ def test_environments_have_the_gradients_that_they_have_alone(scheme):
         alone = given.where(parameters={"barrier_stiffness": stiffness[k].detach()})
         assert torch.equal(found[k], gradients(alone, loss)[NAME])
 
-    # Shared by all environments, it has the sum of their gradients.
+    # A stiffness shared by all environments has the sum of their gradients.
     shared = STIFFNESS.clone().requires_grad_()
     end = sim.step(state, None, sim.default_parameters().replace(barrier_stiffness=shared))
     (together,) = torch.autograd.grad(loss(end[0]) + loss(end[1]), shared)

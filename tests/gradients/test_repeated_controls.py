@@ -1,4 +1,4 @@
-"""What backward asks for again behind a checkpoint must be what the rollout had."""
+"""Controls recomputed by backward behind a checkpoint must equal the rollout's controls."""
 
 import pytest
 import scenes

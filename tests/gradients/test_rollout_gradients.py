@@ -15,7 +15,7 @@ SWEEP = 10.0 ** -np.arange(1.0, 5.01, 0.5)
 
 
 def plateau(f, x, d, scale, rtol):
-    """The difference that agrees best with that of the next smaller step, and how well.
+    """The difference that agrees best with the next smaller step's, and the disagreement.
 
     The sweep ends early on a plateau that is flat to a tenth of rtol.
     """
@@ -68,7 +68,7 @@ SCALES = {
 
 
 def rolled(case, steps):
-    """The weighted end of a rollout with forces held over it, as a function of its inputs."""
+    """Weighted end state of a rollout with constant forces, as a function of its inputs."""
     g = torch.Generator().manual_seed(4)
     state = case.state
     shape = state.positions.shape
@@ -183,9 +183,9 @@ def test_a_sheet_on_a_sphere(frames):
 
 
 def test_a_vertex_on_a_soft_pin_is_the_implicit_euler_recursion():
-    """A triangle whose three equal masses hang on equal springs only translates: one vertex.
+    """A triangle with three equal masses on equal springs only translates, as one vertex does.
 
-    m (x'' + g) + k x = 0 with g = -9.81 along x, by implicit Euler; the numbers are the derivatives
+    Implicit Euler for m (x'' + g) + k x = 0 with g = -9.81 along x; the numbers are the derivatives
     of x_100 by k, m, x_0 and v_0.
     """
     k, m, x0, v0, h, steps = 50.0, 0.3, 0.1, -0.2, 0.01, 100

@@ -15,7 +15,7 @@ F64 = torch.float64
 
 FREE, CONTACT = 1e-6, 1e-5  # relative error
 
-# Steps of the differences: far above rounding, far below what the contacts' geometry resolves.
+# Steps of the differences: far above rounding, far below the length scale of contact geometry.
 STEPS = {
     "state.positions": 1e-5,
     "state.velocities": 2e-3,
@@ -37,8 +37,8 @@ STEPS = {
     "parameters.normal_drag": 1e-2,
     "parameters.tangential_drag": 1e-2,
 }
-RELATIVE_STEP = 2e-3  # of the others
-# Not to be stepped below zero.
+RELATIVE_STEP = 2e-3  # for all other inputs
+# Inputs that differences must not make negative.
 NON_NEGATIVE = (
     "parameters.thickness",
     "parameters.damping",
@@ -54,7 +54,7 @@ CONTACT_PARAMETERS = (
     "parameters.barrier_distance",
     "parameters.slip_velocity",
 )
-# Where a gradient vanishes; everywhere else it must not.
+# Inputs whose gradient vanishes in a regime; all other gradients must not vanish.
 ZERO = dict.fromkeys(("hanging", "curved", "hinge", "woven", "woven_flat"), CONTACT_PARAMETERS)
 
 
@@ -62,9 +62,9 @@ OUTPUTS = ("positions", "velocities", "body_forces")
 
 
 def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01), outputs=OUTPUTS):
-    """Random cotangents of outputs, weighted so that none drowns the others.
+    """Loss by random cotangents of outputs, weighted to comparable size.
 
-    The loss is that of the change of the outputs, so that differences do not cancel digits.
+    The loss is a function of the change of the outputs; this avoids cancellation in differences.
     """
     with torch.no_grad():
         reference = case.step()
@@ -99,7 +99,7 @@ def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None, out
         if only is not None and name not in only:
             continue
         if gradient is None:
-            # What a control replaces is no input of the step.
+            # A value replaced by the control is no input of the step.
             assert name == "state.soft_pin_targets"
             assert "soft_pins" in case.control
             continue
@@ -121,7 +121,7 @@ def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None, out
     assert not problems, "\n".join(problems)
 
 
-# --- The regimes are what they say ---------------------------------------------------------------
+# --- The regimes have the contact that their names state -----------------------------------------
 
 
 def contact_slip(case, after):
@@ -164,7 +164,7 @@ def test_sticking_and_sliding_are_what_they_say():
 
 @pytest.mark.parametrize("name", [n for n in scenes.REGIMES if n not in (*ZERO, "leaving")])
 def test_contact_acts(name):
-    """On bodies, or where there is none, between cloths; before the step, so that friction does."""
+    """Bodies, or cloths without bodies, have contact, also before the step: friction acts too."""
     case = scenes.regime(name)
     after = case.step()
     assert after.report.converged
@@ -214,7 +214,7 @@ def test_free_flight_is_free():
 
 @pytest.mark.parametrize("name", ["pushing", "stacked"])
 def test_some_edges_in_contact_are_nearly_parallel(name):
-    """There the mollifier of edge-edge contacts acts."""
+    """The mollifier of edge-edge contacts acts on these edges."""
     case = scenes.regime(name)
     after = case.step()
     assembly = case.sim._assembly
@@ -285,7 +285,7 @@ ALL = [
     for name in scenes.REGIMES
     for scheme in (COUPLED, ENERGY, ELASTIC, MASS, IDENTITY)
     for iterations in (1, 2)
-    # Where nothing touches at the end, only the friction of the first solve is left.
+    # Without contact at the end, only the friction of the first solve acts.
     if name != "leaving" or (scheme, iterations) == (COUPLED, 1)
 ]
 SLOW = [case for case in ALL if case not in QUICK]
@@ -320,17 +320,17 @@ def test_every_gradient_is_that_of_the_step(name, scheme, iterations):
     free = name in ZERO
     zero = ZERO.get(name, ())
     if name == "landing" and iterations == 1:
-        zero = ("parameters.friction",)  # no contact to take friction from
+        zero = ("parameters.friction",)  # no contact at the start to lag friction at
     if not free and name != "sticking":
-        # The law of sliding does not know where sliding begins; who slides differs by scheme.
+        # Sliding friction does not depend on the slip velocity; the schemes differ in who slides.
         slip = gradients(case, make_loss(case))["parameters.slip_velocity"]
         zero += () if slip.any() else ("parameters.slip_velocity",)
     check(case, FREE if free else CONTACT, zero=zero)
 
 
 @pytest.mark.parametrize("output", range(3), ids=["positions", "velocities", "body_forces"])
-def test_each_output_alone_has_its_gradient(output):
-    """So that the error of a small output cannot hide behind a large one."""
+def test_a_single_output_has_its_gradient(output):
+    """Single outputs: the error of a small output cannot hide behind a large one."""
     case = scenes.regime("pinned", "coupled", None, 2)
     weights = [0.0, 0.0, 0.0]
     weights[output] = 1.0
@@ -404,7 +404,7 @@ def test_coarser_parameters_get_the_sums_of_finer_ones():
 
 
 def test_a_parameter_of_zero_has_its_gradient():
-    """No damping, bending, friction, drag: the gradient with respect to them is one-sided."""
+    """Without damping, bending, friction and drag, their gradients are one-sided."""
     case = scenes.regime("pushing", "coupled", "mass", 2)
     names = ("damping", "bending", "friction", "normal_drag", "tangential_drag")
     check(
@@ -430,12 +430,12 @@ def test_the_length_and_sign_of_a_quaternion_do_not_matter():
 
 @pytest.mark.parametrize(("name", "largest"), [("curved", 1e-2), ("sticking", 3e-2)])
 def test_taylor_remainder_is_of_second_order(name, largest):
-    """Over three decades and more, along a direction in all inputs at once."""
+    """Over more than three decades, along one direction in all inputs."""
     case = scenes.regime(name)
     loss = make_loss(case)
     inputs = case.inputs()
     g = torch.Generator().manual_seed(3)
-    # One unit of each input, in which the solution moves comparably.
+    # Units of the inputs, by which the solution changes comparably.
     unit = {k: STEPS.get(k, RELATIVE_STEP * t.abs().max().item()) for k, t in inputs.items()}
     d = {
         k: 20.0 * unit[k] * torch.randn(t.shape, dtype=F64, generator=g) for k, t in inputs.items()
@@ -465,7 +465,7 @@ def test_a_body_that_only_turns_has_a_gradient_beyond_one_portion():
 
 
 def test_a_cloth_elsewhere_changes_no_derivative_by_the_rest_shape():
-    """A corner presses a face of the other one: its weight is the mean area of that one's faces."""
+    """A corner presses a face of the cloth: its weight is the mean area of that cloth's faces."""
     case = scenes.poking()
     (cloth,), (box,) = case.sim.scene.cloths, case.sim.scene.bodies
     elsewhere = dc.Cloth.grid(3, 3, size=(0.3, 0.3), pose=[9, 0, 0, 1, 0, 0, 0])
@@ -496,7 +496,7 @@ def test_a_cloth_elsewhere_changes_no_derivative_by_the_rest_shape():
 
 
 def test_friction_iterations_change_the_step():
-    """Otherwise a chain through them would prove nothing."""
+    """Premise: tests of gradients through friction iterations need an effect of the iterations."""
     one, two, three = (scenes.regime("pushing", "coupled", "mass", k) for k in (1, 2, 3))
     values = one.inputs()
     x1, x2, x3 = (case.step(values).positions for case in (one, two, three))
@@ -504,8 +504,8 @@ def test_friction_iterations_change_the_step():
     assert 1e-7 < (x2 - x3).abs().max() < (x1 - x2).abs().max()
 
 
-def test_what_lands_feels_friction_in_the_same_step():
-    """Nothing touches at its start: the second solve takes friction from the end of the first."""
+def test_a_landing_sheet_has_friction_in_the_same_step():
+    """No contact at the start: the second solve lags friction at the end of the first."""
     one, two = (scenes.regime("landing", friction_iterations=k) for k in (1, 2))
     values = one.inputs()
     a, b = (case.step(values).contact_forces for case in (one, two))
@@ -513,7 +513,7 @@ def test_what_lands_feels_friction_in_the_same_step():
 
 
 def test_scenes_are_differentiable_in_everything():
-    """No input is forgotten by these tests."""
+    """These tests cover every input."""
     sim = scenes.regime("woven_pinned").sim
     parameters = {
         k for k, v in vars(sim.default_parameters()).items() if isinstance(v, torch.Tensor)
@@ -524,7 +524,7 @@ def test_scenes_are_differentiable_in_everything():
         *(f"control.{name}" for name in scenes.CONTROL),
         *(f"parameters.{name}" for name in parameters),
     }
-    # Those of bodies and robots in motion are in tests/bodies/test_gradients.py, those of
-    # attachments in test_attachment_gradients.py.
+    # tests/bodies/test_gradients.py covers bodies and robots in motion;
+    # test_attachment_gradients.py covers attachments.
     elsewhere = {n for n, q in PARAMETERS.items() if {"K", "L", "J", "A"} & set(q.axes[-1])}
     assert parameters | elsewhere == set(PARAMETERS)

@@ -1,6 +1,6 @@
 """Tangents of a step against its gradients, <u, J v> = <J^T u, v>, and against differences.
 
-Both are asked of the core: each input that a step has gets a tangent, each output a cotangent.
+The core computes both: each input of a step has a tangent, each output a cotangent.
 """
 
 from functools import cache
@@ -135,7 +135,7 @@ STEPS = {
 
 @cache
 def taken(name):
-    """Core, inputs, and what it gives for them, with a tape."""
+    """Core, inputs and outputs of a step, with a tape."""
     make, *arguments = STEPS[name]
     core, inputs = make(*arguments)
     result = core.forward(inputs, True, 2)
@@ -145,14 +145,14 @@ def taken(name):
 
 @pytest.mark.parametrize("name", STEPS)
 def test_tangents_are_the_transpose_of_gradients(name):
-    # GMRES ends where its residual is 1e-12 of the right side, solves of the others at rounding.
+    # GMRES ends at a residual of 1e-12 of the right side, the other solves at rounding.
     tolerance = 3e-11 if name.startswith("nodes") else 1e-11
     moved = check_pairs(*taken(name), tolerance)
     assert {"positions", "velocities"} <= moved
 
 
 @pytest.mark.parametrize("name", ["coupled-pinned", "split-elastic-pinned", "robot-floating"])
-def test_what_is_not_kept_is_found_again(name):
+def test_forgotten_factors_change_no_bit_of_tangents(name):
     core, inputs, result = taken(name)
     names, tangents = directions(inputs)
     fresh = core.forward(inputs, True, 1)
@@ -165,7 +165,7 @@ def test_what_is_not_kept_is_found_again(name):
 
 
 @pytest.mark.parametrize("name", ["coupled-pinned", "split-elastic-folded_thick"])
-def test_each_direction_has_the_bits_that_it_has_alone(name):
+def test_several_directions_have_the_bits_of_single_ones(name):
     core, inputs, result = taken(name)
     names, tangents = directions(inputs)
     tape, kept = tape_of(result), result["kept"]

@@ -1,4 +1,4 @@
-"""Tangents through torch against backward, <u, J v> = <J^T u, v>, of everything at once."""
+"""Tangents through torch against backward, <u, J v> = <J^T u, v>, for all inputs at once."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def check(function, inputs):
     """<u, J v> = <J^T u, v>, for each output with all inputs, whose tangents are random.
 
     Args:
-        function: From a list of tensors to one.
+        function: Map from a list of tensors to one tensor.
         inputs: The tensors.
     """
     inputs = [t.detach().to(F64) for t in inputs]
-    # Of the size of what they change: rounding of the largest shall not hide the others.
+    # Tangents have the scale of their inputs: rounding of the largest must not hide the others.
     v = [
         d * max(float(t.abs().max()), 1e-3) for d, t in zip(random(inputs, 1), inputs, strict=True)
     ]
@@ -289,14 +289,14 @@ def test_jacobians_of_pickers_in_a_batch():
 
     values = torch.cat([torch.full((4,), 0.5, dtype=F64), torch.zeros(6, dtype=F64)])
     found, expected = torch.func.jacfwd(end)(values), torch.func.jacrev(end)(values)
-    # Both are exact: they differ by the rounding of two solves.
+    # Both are exact up to the rounding of two solves.
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11 * float(expected.abs().max()))
     assert found[0, ..., :2].any()
     assert not found[0, ..., 2:4].any()
 
 
 class TestFailures:
-    """With throw=False a failed environment has no tangent, and the others have theirs."""
+    """With throw=False a failed environment has no tangent, and the others have tangents."""
 
     def run(self, moved):
         cloth = dc.Cloth.grid(6, 6, (0.3, 0.3), pose=[0, 0, 0.2, 1, 0, 0, 0])
@@ -312,11 +312,11 @@ class TestFailures:
             assert after.report.status == ("converged", "not_converged")
             return forward_ad.unpack_dual(after.positions).tangent
 
-    def test_they_raise(self):
+    def test_failed_environments_raise(self):
         with pytest.raises(dc.SimulationError, match=r"step: .*environments \[1\]"):
             self.run(torch.ones_like)
 
-    def test_the_others_have_theirs(self):
+    def test_other_environments_have_tangents(self):
         def first(x):
             direction = torch.zeros_like(x)
             direction[0] = 1.0

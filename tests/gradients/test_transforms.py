@@ -1,4 +1,4 @@
-"""Transforms of torch.func, wherever they begin, find what backward finds."""
+"""Transforms of torch.func, entered at any call, agree with backward."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def moving(sim, x):
 
 
 def start(sim, name):
-    """Where the call is differentiated: pins at their places, everything else at rest."""
+    """Point of differentiation: pins at their places, zero for all other inputs."""
     places = sim.initial_state().positions[[0, 3]] if "pins" in name or name == "rollout" else 0.0
     if name == "control":
         places = sim.initial_state().positions[[0, 3]]

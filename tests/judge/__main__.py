@@ -1,4 +1,4 @@
-"""Judge what optimizations found: does anything intersect, in any state or on any path?
+"""Judge results of optimizations: search for intersections in all states and on all paths.
 
     diffcloth optimize configs/push_cube.yaml --set output.viewers=[]
     python tests/judge results/push_cube

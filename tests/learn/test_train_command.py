@@ -169,7 +169,7 @@ def test_a_page_shows_all_episodes_of_the_evaluation(config, tmp_path):
     assert not (out / "evaluation.png").exists()
 
 
-def test_success_ends_it(config, tmp_path):
+def test_success_ends_the_training(config, tmp_path):
     result = call(config, "--out", tmp_path / "out", "--set", "until_success=0.0")
     assert result.exit_code == 0, result.output
     record = json.loads((tmp_path / "out" / "train.json").read_text())

@@ -1,4 +1,4 @@
-"""Policies by gradients: the gradient, the critic's aims, checkpoints, and that they improve."""
+"""Policies by gradients: gradients, critic targets, checkpoints, and improvement of returns."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fold(size=6, horizon=8):
 
 
 def exact(num_envs):
-    """Environments whose steps are solved to 1e-10, to compare with differences."""
+    """Environments with a solver tolerance of 1e-10, for comparison with differences."""
     env = fold()(num_envs=num_envs)
     sim = env.task.simulator
     solver = dc.SolverOptions(throw=False, tolerance=1e-10)
@@ -59,7 +59,7 @@ def assert_same_bits(a, b):
 
 
 class TestGradient:
-    """Of the loss of one rollout, with a critic that is far from constant."""
+    """Gradient of the loss of one rollout, with a critic that is far from constant."""
 
     OPTIONS = TrainerOptions(
         algorithm="shac", horizon=5, first_action=HOLD, feedback=True, init_std=0.02
@@ -135,7 +135,7 @@ class TestGradient:
 
 
 class TestPlan:
-    """Of a policy that is a plan, a linear function of what it sees, and a network."""
+    """Plan of a policy: knots, plus a linear function and a network of the observation."""
 
     def test_draws_lines_between_its_knots(self):
         plan = Plan(3, torch.tensor([0.5, -1.0]), 3)
@@ -206,7 +206,7 @@ class TestTensorAdam:
     """Adam with one scale for each tensor."""
 
     def test_is_adam_where_numbers_are_alone(self):
-        """Beside Adam of torch, whose tensors of one number have a scale of their own, too."""
+        """For tensors of one number, torch's Adam has the same scales."""
         ours, theirs = (
             [torch.tensor([0.3], requires_grad=True), torch.tensor(-2.0, requires_grad=True)]
             for _ in range(2)
@@ -247,7 +247,7 @@ class TestTensorAdam:
         np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-4, atol=1e-5)
 
     def test_moves_little_what_counts_little(self):
-        """The first step is along the gradient, where that of Adam has the same size everywhere."""
+        """The first step is along the gradient; Adam's first step has equal entries."""
         moved = {}
         for scale in ("number", "tensor"):
             options = TrainerOptions(
@@ -289,10 +289,10 @@ def test_lambda_returns_are_those_of_the_recursion():
 
 
 class TestEntropy:
-    """Of SAPO: its value, what it is worth, and who learns from it."""
+    """Entropy of SAPO: its value, its weight, and its effect on policy and critics."""
 
     def test_is_that_of_the_density(self):
-        """Minus the logarithm of the density, beside torch.distributions, also at its edges."""
+        """Minus the log density of torch.distributions, also at the edges of the range."""
         first = torch.tensor([0.0, 0.95, -0.3])
         torch.manual_seed(0)
         actor = Actor(4, first, [8], 0.3, sees_width=True)
@@ -303,7 +303,7 @@ class TestEntropy:
         with torch.no_grad():
             mean, width = actor.layers(scaled).split(3, dim=-1)
             deviation = (actor.log_deviation + 2 * width.tanh()).exp()
-        assert float(deviation.max() / deviation.min()) > 3  # depends on what is seen
+        assert float(deviation.max() / deviation.min()) > 3  # depends on the observation
         normal = torch.distributions.Normal(mean.double(), deviation.double())
         squash = torch.distributions.TanhTransform()
         before = (mean + deviation * noise).double()
@@ -312,7 +312,7 @@ class TestEntropy:
         torch.testing.assert_close(actions, before.tanh().float())
         assert float(actions.abs().max()) > 0.999
 
-    def test_its_worth_grows_where_there_is_too_little(self):
+    def test_the_weight_grows_with_too_little_entropy(self):
         for target, sign in ((5.0, 1), (-5.0, -1)):
             options = TrainerOptions("sapo", horizon=2, first_action=HOLD, target_entropy=target)
             trainer = Trainer(fold(), options, num_envs=2)
@@ -322,13 +322,13 @@ class TestEntropy:
             assert sign * (trainer.policy.temperature - before) > 0
 
     def test_is_part_of_the_loss_and_of_what_critics_learn(self):
-        """With rewards far below what entropy is worth, both are those of the entropy alone."""
+        """If the entropy bonus dominates rewards, loss and critic targets are the entropy's."""
         options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, gae_lambda=1.0)
         trainer = Trainer(fold(), options, num_envs=2)
         (rollout,) = trainer._rollouts()
         worth = sum(0.5**t * rollout.entropies[t] for t in range(3)).mean()
         assert rollout.loss == pytest.approx(-1e4 * float(worth) / 3, rel=1e-3)
-        # Values are near zero at first, so that their errors are what entropy is worth.
+        # Values are near zero at first, so their errors equal the entropy bonus.
         assert trainer._fit_critics(_Rows([rollout])) > 1e6
 
     def test_critics_differ_and_their_least_is_learned(self, monkeypatch):
@@ -348,7 +348,7 @@ class TestEntropy:
         assert kept[0].shape == (3, 2)
         torch.testing.assert_close(kept[0], torch.full((3, 2), -2.0), atol=0.5, rtol=0)
 
-    def test_only_sapo_has_it(self):
+    def test_only_sapo_has_entropy(self):
         for algorithm in ("apg", "shac"):
             trainer = Trainer(fold(), TrainerOptions(algorithm, horizon=2), num_envs=2)
             assert trainer.policy.temperature == 0.0
@@ -489,7 +489,7 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
 
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 def test_a_failure_costs_all_that_is_left(algorithm, monkeypatch):
-    """In evaluations, which tryouts compare, in rollouts, and in what critics learn."""
+    """The cost counts in evaluations (compared by tryouts), rollouts and critic targets."""
     from diffcloth_torch.envs import env as module
 
     worst, horizon = FoldCloth.worst, 6
@@ -537,10 +537,10 @@ def lift_corner(num_envs):
 
 
 class CarryStrip(Task):
-    """A strip hangs from its upper edge, which a hand moves; its center is to be 6 cm away.
+    """A strip hangs from its upper edge, which a hand moves; its center must move by 6 cm.
 
-    The distance is a smooth function of every action, so that no training waits for a first
-    success, which would come sooner or later with the rounding.
+    The distance is a smooth function of every action. Training therefore does not wait for a first
+    success, whose time would depend on rounding.
     """
 
     name = "CarryStrip"
@@ -587,13 +587,13 @@ def carry_strip(num_envs):
     return envs.make(CarryStrip(), num_envs)
 
 
-# After nine updates the return is .46 to .54 of the first one: five seeds of each algorithm. It
-# is the same to .001 with portable instructions and with AVX-512.
+# After nine updates the return is .46 to .54 of the first return, for five seeds of each algorithm.
+# Portable instructions and AVX-512 agree to .001.
 @pytest.mark.rounding
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 @pytest.mark.quick("*-0", "apg-*")
-def test_it_improves(algorithm, seed):
+def test_training_improves_the_return(algorithm, seed):
     options = TrainerOptions(
         algorithm=algorithm, horizon=10, learning_rate=4e-3, init_std=0.05, seed=seed
     )
@@ -606,13 +606,13 @@ def test_it_improves(algorithm, seed):
     assert after > 0.7 * before
 
 
-# Of four seeds: where one scale serves a tensor the return is .32 to .34 of the first one, and .49
-# to .61 of the return where each number has its own.
+# For four seeds, the return with one scale per tensor is .32 to .34 of the first return, and .49 to
+# .61 of the return with one scale per number.
 @pytest.mark.quick("0")
 @pytest.mark.rounding
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_plan_with_one_scale_improves_faster(seed):
-    """Steps along the gradient lift the corner while steps of one size also pull elsewhere."""
+    """Steps along the gradient lift the corner; steps of equal size also pull elsewhere."""
     found = {}
     for scale in ("number", "tensor"):
         options = TrainerOptions(

@@ -63,7 +63,7 @@ def divide(number):
 
 
 def dies_in_its_first_worker(path, main, num_envs):
-    """Make environments, but kill the first process that is to make them for the trainer."""
+    """Make environments, but kill the first worker process that makes them."""
     if os.getpid() != main and not path.exists():
         path.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -98,7 +98,7 @@ def die(_):
 
 
 @pytest.mark.slow
-def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
+def test_unfinished_pieces_of_a_dead_process_are_repeated(tmp_path):
     workers = Processes(2)
     try:
         items = [(tmp_path / "died", k) for k in range(4)]
@@ -111,7 +111,7 @@ def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
 
 
 class TwoArgumentsError(Exception):
-    """Its pickle cannot be read, as it keeps one argument of two."""
+    """An error whose pickle cannot be read, because it stores one argument of two."""
 
     def __init__(self, what, where):
         super().__init__(f"{what} in {where}")
@@ -121,7 +121,7 @@ def fail(item):
     raise TwoArgumentsError("no cloth", item)
 
 
-def test_what_a_piece_raises_is_told_whatever_its_class():
+def test_an_error_of_a_piece_is_reported_for_any_class():
     workers = Processes(1)
     try:
         with pytest.raises(RuntimeError, match="raised TwoArgumentsError: no cloth in 3"):
@@ -165,9 +165,10 @@ class TestRay:
     @pytest.fixture(scope="class")
     def ray(self):
         with pytest.MonkeyPatch.context() as patch:
-            # Before the import, or Ray's processes disagree about it: a cluster of this test alone.
+            # Set before the import; otherwise Ray's processes disagree. The cluster serves only
+            # this test.
             patch.setenv("RAY_AUTH_MODE", os.environ.get("RAY_AUTH_MODE", "disabled"))
-            # Its processes import this file.
+            # Ray's processes import this file.
             for folder in Path(__file__).parents[:2]:
                 patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
             ray = pytest.importorskip("ray")
@@ -196,7 +197,7 @@ class TestRay:
             workers.close()
 
     @pytest.mark.slow
-    def test_who_dies_again_and_again_ends_it(self, ray):
+    def test_an_actor_that_dies_again_and_again_ends_the_work(self, ray):
         workers = RayActors(1)
         try:
             with pytest.raises(WorkerError, match="RayActors: piece 0 of 1 was given up after 4"):
@@ -205,10 +206,10 @@ class TestRay:
             workers.close()
 
     @pytest.mark.slow
-    def test_an_actor_that_stops_ends_it_at_the_deadline(self, ray):
+    def test_an_actor_that_stops_ends_the_work_at_the_deadline(self, ray):
         workers = RayActors(1, deadline=600.0)
         workers.map(str, [1])
-        workers._deadline = 1.0  # it has started
+        workers._deadline = 1.0  # the actor has started
         with pytest.raises(WorkerError, match="piece 1 of 2 did not end within the deadline of"):
             workers.map(time.sleep, [0, 1000])
         with pytest.raises(InvalidInput, match="have been closed"):
@@ -312,7 +313,7 @@ def test_ranks_need_a_job():
         Ranks()
 
 
-def test_what_cannot_be_sent_is_refused():
+def test_objects_that_cannot_be_pickled_are_refused():
     with pytest.raises(InvalidInput, match="can be pickled"):
         Trainer(lambda num_envs: MAKE(num_envs=num_envs), OPTIONS, workers=Processes(1))
     for workers in (2, Processes):

@@ -1,4 +1,4 @@
-"""Symmetric matrices of 3x3 blocks: patterns, values, the dense matrix, and factors of them."""
+"""Symmetric matrices of 3x3 blocks: patterns, values, dense matrices and factors."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from diffcloth_torch import _kernels as kernels
 
-STEP = 0.01  # of the cloth's Hessians [s]
-SINGLE = "multifrontal, single precision"  # our own backend, asked for such factors
+STEP = 0.01  # time step of the cloth's Hessians [s]
+SINGLE = "multifrontal, single precision"  # our own backend in single precision
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,10 @@ class BlockMatrix:
     """Lower blocks by column, then by row.
 
     Attributes:
-        size: Vertices.
-        pairs: [k, 2] (row, column), every diagonal block among them.
+        size: Number of vertices.
+        pairs: [k, 2] (row, column), including every diagonal block.
         blocks: [k, 9] column-major.
-        fixed: [size] vertices left out.
+        fixed: [size] True for vertices left out.
     """
 
     size: int
@@ -42,7 +42,7 @@ class BlockMatrix:
         return full[np.ix_(self.unknowns, self.unknowns)]
 
     def shifted(self, shift: float) -> BlockMatrix:
-        """With a multiple of the identity added."""
+        """The matrix plus a multiple of the identity."""
         blocks = self.blocks.copy()
         blocks[np.ix_(self.pairs[:, 0] == self.pairs[:, 1], [0, 4, 8])] += shift
         return BlockMatrix(self.size, self.pairs, blocks, self.fixed)
@@ -65,7 +65,7 @@ class BlockMatrix:
         return kernels.CholeskyFactor(analysis, single=backend == SINGLE)
 
     def factor(self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"):
-        """A factor, which must come out positive definite."""
+        """A factor; the matrix must be positive definite."""
         factor = self.empty_factor(backend, level, ordering)
         assert factor.compute(self.blocks, kernels.CholeskyWorkspace())
         return factor
@@ -117,7 +117,7 @@ def random_matrix(
 
 
 def grid_pairs(rows: int, columns: int, reach: int) -> list[tuple[int, int]]:
-    """Vertices of a grid, coupled where they are up to `reach` apart."""
+    """Pairs of grid vertices at most `reach` rows and columns apart."""
     pairs = []
     for i in range(rows):
         for j in range(columns):

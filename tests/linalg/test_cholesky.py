@@ -23,8 +23,8 @@ LEVELS = kernels.kernel_levels()
 DOUBLES = [pytest.param("multifrontal", level, id=level) for level in LEVELS]
 DOUBLES += [pytest.param(b, "", id=b) for b in kernels.cholesky_backends() if b != "multifrontal"]
 METHODS = [*DOUBLES, *(pytest.param(SINGLE, level, id=f"{level}, single") for level in LEVELS)]
-# Units of roundoff that residuals and the definite are judged by: n eps is the usual bound for n
-# unknowns, and factors have far shorter sums.
+# Units of roundoff for judging residuals and definiteness: n eps is the usual bound for n unknowns,
+# and factors have far shorter sums.
 ROUNDING = {SINGLE: 1e-5}
 
 
@@ -106,7 +106,7 @@ def test_analysis_counts_what_a_dense_elimination_fills(matrix):
 
 
 def test_merged_supernodes_store_few_zeros():
-    """Ours against the exact structure, which Eigen has, in the same order."""
+    """Our factor against Eigen's exact structure, in the same elimination order."""
     matrix = cloth_matrix(24)
     exact, stored = (matrix.analysis(b).nonzeros() for b in ("eigen", "multifrontal"))
     assert exact <= stored <= 1.2 * exact
@@ -185,7 +185,7 @@ def test_a_failed_factor_is_not_used_and_recovers(backend, level):
 
 @pytest.mark.parametrize(("backend", "level"), METHODS)
 def test_history_leaves_no_trace(backend, level):
-    """One factor and one workspace for many matrices: the bits of new ones."""
+    """A reused factor and workspace yield the bits of new ones."""
     workspace = kernels.CholeskyWorkspace()
     b = np.random.default_rng(7).normal(size=(1, 196, 3))
     for contacts in (0, 60, 5):
@@ -223,7 +223,7 @@ def test_levels_with_fused_arithmetic_agree_in_every_bit(name, backend):
 @pytest.mark.quick("portable", "avx512, single")
 @pytest.mark.parametrize(("backend", "level"), METHODS)
 def test_threads_do_not_disturb_each_other(backend, level):
-    """Eight threads factor and solve at once, at sizes where a shared BLAS went wrong."""
+    """Eight threads factor and solve at once, at sizes at which a shared BLAS once failed."""
     matrices = [cloth_matrix(n, contacts=20, seed=n) for n in (12, 18, 24)]
     b = [np.random.default_rng(n).normal(size=(2, m.size, 3)) for n, m in enumerate(matrices)]
     factors = [m.factor(backend, level) for m in matrices]
@@ -242,7 +242,7 @@ def test_threads_do_not_disturb_each_other(backend, level):
 
 
 def test_a_forked_process_factors_too():
-    """A fork takes no threads along, and must not take locks or caches of them."""
+    """A fork copies no threads, and must not copy their locks or caches."""
     matrix = cloth_matrix(16)
     b = np.ones((1, matrix.size, 3))
     expected = solve(matrix.factor(), b)

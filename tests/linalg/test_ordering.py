@@ -29,7 +29,7 @@ def test_large_graphs_of_any_kind_are_solved(name):
     x = np.random.default_rng(1).normal(size=(size, 3))
     b = matrix.product(x)
     y = solve(matrix.factor(), b[None])[0]
-    # Rows are scaled apart, so that residuals are judged row by row; a few roundings of their sums.
+    # Rows have different scales, so residuals are judged row by row: a few roundings of their sums.
     scale = np.sqrt(matrix.blocks[matrix.pairs[:, 0] == matrix.pairs[:, 1], 0])[:, None]
     residual = np.abs(matrix.product(y) - b) / scale
     assert residual.max() <= 1e-12 * np.abs(b / scale).max()

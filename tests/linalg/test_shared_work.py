@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from block_matrices import cloth_matrix, grid_pairs, kernels, random_matrix, solve
 
-# All are large enough to be shared.
+# All matrices are large enough for shared work.
 MATRICES = {
     "cloth": lambda: cloth_matrix(44),
     "cloth in contact": lambda: cloth_matrix(40, contacts=400),
     "pinned": lambda: cloth_matrix(44).with_fixed(list(range(0, 44 * 44, 97))),
-    # The top of the tree is all there is to do.
+    # The top of the elimination tree has all the work.
     "dense with leaves": lambda: random_matrix(320, dense(290) + [(290 + k, k) for k in range(30)]),
-    # Sheets of several sizes, the last one without neighbors, numbered across each other.
+    # Sheets of several sizes with interleaved numbers; the last one has no neighbors.
     "disconnected": lambda: random_matrix(2960, scattered((30, 12, 34, 24, 6)), seed=3),
-    # Two sheets and many vertices by themselves, all coupled to one row, as to that of a body.
+    # Two sheets and many isolated vertices, all coupled to one row, as to a body's row.
     "star": lambda: random_matrix(1802, star((30, 24), 325), seed=4),
 }
 THREADS = (2, 3, 4)
@@ -87,7 +87,7 @@ def test_shared_solutions_have_a_residual_of_rounding(name):
     sizes = type(made)(made.size, made.pairs, np.abs(made.blocks), made.fixed)
     x[made.fixed] = 0.0
     bound = sizes.product(np.abs(x)) + np.abs(b)
-    # As in test_cholesky.py.
+    # Bound of test_cholesky.py.
     assert (np.abs(made.product(x) - b)[free] <= 1e-13 * bound[free]).all()
 
 
@@ -125,7 +125,7 @@ def test_an_indefinite_matrix_is_found_wherever_it_is(name, threads):
     assert np.array_equal(solve(factor, b, threads=threads), expected)
 
 
-def test_one_workspace_serves_matrices_of_any_size():
+def test_a_workspace_serves_matrices_of_any_size():
     workspace = kernels.CholeskyWorkspace(2)
     small = cloth_matrix(10)
     for _ in range(3):
@@ -172,7 +172,7 @@ def chain(count: int) -> list[list[int]]:
 
 
 def tree(count: int) -> list[list[int]]:
-    """A binary tree: work i waits for 2 j and 2 j + 1 of the first half, and so on up."""
+    """A binary tree: each inner work waits for two works of the row below."""
     before = [[] for _ in range(count)]
     row = list(range(count))
     while len(row) > 1:
@@ -190,7 +190,7 @@ def at_random(count: int) -> list[list[int]]:
 
 @pytest.mark.parametrize("threads", [-1, 0, 1, 2, 3, 8])
 @pytest.mark.parametrize("before", [[], [[]], [[]] * 9, chain(20), tree(16), at_random(60)])
-def test_each_work_waits_for_those_before_it(before, threads):
+def test_works_wait_for_their_predecessors(before, threads):
     taken = kernels.run_team(before, threads, 0.0, 200)
     assert sorted(turn for _, turn in taken) == list(range(len(before)))
     assert all(0 <= member < max(threads, 1) for member, _ in taken)
@@ -204,6 +204,6 @@ def test_works_are_begun_in_their_order_by_all_members():
 
 
 def test_no_member_waits_while_another_work_may_begin():
-    # The first one is long, and the second waits for it: the others must not.
+    # The first work is long and the second waits for it; the others must not wait.
     taken = kernels.run_team([[], [0], [], [], []], 2, 0.05)
     assert taken[1][1] > 1

@@ -1,4 +1,4 @@
-"""Factors in single precision: what they can tell, their range, and solves to rounding."""
+"""Factors in single precision: verdicts on definiteness, range, and solves to rounding."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def agrees(matrix: BlockMatrix, factor, b: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_powers_of_two_change_no_bit_of_the_significands(level):
-    """Units, and coordinates in units of their own, far beyond the range of floats."""
+    """Scales of units and of single coordinates, far beyond the range of floats."""
     matrix = cloth_matrix(12, contacts=40)
     rng = np.random.default_rng(1)
     b = rng.normal(size=(2, matrix.size, 3))
@@ -96,7 +96,7 @@ def test_a_verdict_is_right_or_none(name, level):
         "cloth": lambda: cloth_matrix(9),
         "cloth in contact": lambda: cloth_matrix(9, contacts=30),
     }[name]()
-    # With a diagonal of ones, to which rounding is relative.
+    # Scaled to a unit diagonal, to which rounding is relative.
     dense = matrix.dense()
     root = np.sqrt(np.diag(dense))
     unit = scaled(matrix, 1.0 / root)
@@ -116,7 +116,7 @@ def test_a_verdict_is_right_or_none(name, level):
 
 
 def tied_pair() -> BlockMatrix:
-    """Two vertices that a stiff spring ties together; what holds them is 1e-6 of it."""
+    """Two vertices tied by a stiff spring and held by springs of 1e-6 its stiffness."""
     blocks = np.zeros((3, 9))
     blocks[:, [0, 4, 8]] = np.array([1.0 + 1e-6, -1.0, 1.0 + 1e-6])[:, None]
     pairs = np.array([[0, 0], [1, 0], [1, 1]], np.int32)
@@ -132,7 +132,7 @@ def test_small_pivots_are_left_to_doubles():
 
 
 def beside(first: BlockMatrix, second: BlockMatrix) -> BlockMatrix:
-    """Both, uncoupled; eliminated in this order."""
+    """Both matrices, uncoupled; eliminated in this order."""
     pairs = np.concatenate([first.pairs, second.pairs + first.size]).astype(np.int32)
     blocks = np.concatenate([first.blocks, second.blocks])
     return BlockMatrix(
@@ -141,7 +141,7 @@ def beside(first: BlockMatrix, second: BlockMatrix) -> BlockMatrix:
 
 
 def test_the_first_pivot_that_fails_decides_for_any_number_of_threads():
-    """A large sheet fails late, while another thread has long been at the pair behind it."""
+    """A large sheet fails late; another thread reaches the pair behind the sheet much earlier."""
     sheet = cloth_matrix(44)
     diagonal = np.flatnonzero(sheet.pairs[:, 0] == sheet.pairs[:, 1])
     workspaces = {threads: kernels.CholeskyWorkspace(threads) for threads in (1, 2, 3)}
@@ -159,7 +159,7 @@ def test_the_first_pivot_that_fails_decides_for_any_number_of_threads():
 
 
 def test_subnormal_numbers_are_zero_inside_and_come_back():
-    """Far from a load a sheet that its inertia holds moves by less than 1e-38 of it."""
+    """Far from a load, a sheet dominated by inertia moves by less than 1e-38 of the load."""
     matrix = cloth_matrix(30).shifted(1e9)
     b = np.zeros((1, matrix.size, 3))
     b[0, 0] = 1.0
@@ -186,7 +186,7 @@ def test_solutions_to_rounding(contacts, level):
 
 
 def test_several_right_sides_have_the_bits_of_one():
-    """Each has its own iterations, however many the others need."""
+    """Each right side has its own iterations, independent of the others'."""
     matrix = cloth_matrix(14, contacts=60)
     factor = matrix.factor(SINGLE)
     rng = np.random.default_rng(5)
@@ -208,7 +208,7 @@ def test_a_matrix_that_floats_hold_is_solved_at_once():
 
 
 def test_a_factor_of_another_matrix_is_found_out():
-    """Where it takes too many iterations, or the matrix is not definite."""
+    """The refinement takes too many iterations, or the matrix is not definite."""
     matrix = cloth_matrix(14)
     b = np.random.default_rng(6).normal(size=(2, matrix.size, 3))
     far = matrix.shifted(1e7).factor(SINGLE)
@@ -217,7 +217,7 @@ def test_a_factor_of_another_matrix_is_found_out():
 
 
 def test_huge_numbers_of_vertices_left_out_make_no_solution_zero():
-    """They scale the others to where products underflow: no solution is better than zero."""
+    """Huge numbers scale the others so that products underflow: no solution, instead of zero."""
     matrix = cloth_matrix(10).with_fixed([0])
     b = np.ones((2, matrix.size, 3))
     b[0, 0] = 1e300
@@ -242,16 +242,16 @@ def test_right_sides_that_do_not_converge_leave_the_others_alone():
 
 @pytest.mark.parametrize("size", [12, 24])
 def test_a_negative_direction_keeps_any_right_side_from_converging(size):
-    """Though single precision finds the matrix definite, as rounding hides it."""
+    """Single precision finds the matrix definite, because rounding hides the direction."""
     matrix = cloth_matrix(size)
     root = np.sqrt(np.diag(matrix.dense()))
     unit = scaled(matrix, 1.0 / root)
     least = np.linalg.eigvalsh(unit.dense())[0]
     factor = unit.shifted(-least + 1e-6).factor(SINGLE)
-    # Just below zero, where that factor has 1e-6.
+    # The least eigenvalue is just below zero; the factor's matrix has 1e-6.
     hidden = unit.shifted(-least - 1e-9)
     assert not hidden.is_positive()
     for b in np.random.default_rng(7).normal(size=(20, matrix.size, 3)):
         assert not agrees(hidden, factor, b)
-        # Where it is the factor of.
+        # The matrix of the factor.
         assert agrees(unit.shifted(-least + 1e-6), factor, b)

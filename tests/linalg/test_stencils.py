@@ -1,11 +1,11 @@
-"""Matrices of stencils that are made of vectors: against numpy, at every level, on any rows."""
+"""Stencil matrices built from vectors: against numpy, at every level, on any rows."""
 
 import numpy as np
 import pytest
 
 from diffcloth_torch import _kernels as kernels
 
-SIZE = 40  # vertices: the first columns are longer than a search takes without its loop
+SIZE = 40  # vertices; the first columns are long enough for the loop of the search
 ROWS = {
     "in order": [3, 9, 20, 39, 38],
     "backwards": [39, 30, 17, 2, 0],
@@ -73,7 +73,7 @@ def by_core(given: dict[str, np.ndarray]) -> tuple[dict, np.ndarray]:
 
 
 def dense(blocks: list[float]) -> np.ndarray:
-    """The lower blocks of all pairs, column by column; what is above stays zero."""
+    """Lower blocks of all pairs, column by column; the upper blocks remain zero."""
     result = np.zeros((SIZE, 3, SIZE, 3))
     k = 0
     values = np.array(blocks).reshape(-1, 3, 3)

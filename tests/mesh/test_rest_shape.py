@@ -1,4 +1,4 @@
-"""Topology and rest shape: counts, geometry, unfolding, and the cotangents of all of it."""
+"""Topology and rest shape: counts, geometry, unfolding and cotangents."""
 
 import functools
 
@@ -54,14 +54,14 @@ def strip():
 
 
 def long_strip():
-    """One triangle wide, irregular: no point determines the curvature across it well."""
+    """An irregular strip, one triangle wide: no point determines its transverse curvature well."""
     X, faces = grid(6, 2)
     X[:, :2] += np.random.default_rng(4).uniform(-0.15, 0.15, (len(X), 2))
     return X / [1, 4, 1], faces
 
 
 def nearly_undetermined(bend):
-    """A strip whose boundaries leave a pair of lines by `bend`: quadratics between rank 2 and 3."""
+    """A strip whose boundaries deviate from two lines by `bend`: quadratic fits of rank 2 to 3."""
     X, faces = grid(6, 2)
     X[:, 1] += bend * np.random.default_rng(6).uniform(-1, 1, len(X))
     return X, faces
@@ -159,7 +159,7 @@ def test_areas_and_gradients(mesh):
 
 
 def test_interior_patches_differentiate_quadratics_exactly():
-    """x,ab of every patch with its full rank, in the frame of its triangle."""
+    """Second derivatives x,ab of every full-rank patch, in the frame of its triangle."""
     X, faces = flat(5, 5)
     elastic = Elastic(X, faces, "patch")
     rest = elastic.rest()
@@ -176,14 +176,14 @@ def test_interior_patches_differentiate_quadratics_exactly():
         e1 /= np.linalg.norm(e1)
         frame = np.array([e1, [-e1[1], e1[0]]])
         turned = frame @ hessian @ frame.T
-        # The filter of the fit differs from the inverse by at most 0.7 % where it is well posed.
+        # The filter of a well-posed fit differs from the inverse by at most 0.7 %.
         np.testing.assert_allclose(
             second, [turned[0, 0], turned[0, 1], turned[1, 1]], atol=7e-3 * np.abs(hessian).max()
         )
 
 
 def test_the_curvature_of_a_cylinder():
-    """One principal curvature 1 / r along the normal, none across."""
+    """One principal curvature is 1 / r along the normal, the other zero."""
     X, faces = grid(9, 9)
     r, spacing = 2.0, 0.1
     s, t = spacing * X[:, 0], spacing * X[:, 1]
@@ -237,7 +237,7 @@ FIELDS = [
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
 @pytest.mark.parametrize("mesh", MESHES)
 def test_vjp_matches_differences(mesh, bending_model):
-    """All fields at once, against a cotangent of cos(k + 1) for entry k of each."""
+    """All fields at once, with the cotangent cos(k + 1) for entry k of each field."""
     X, faces = mesh() if mesh not in (flat, curved) else mesh(4, 3)
     elastic = Elastic(X, faces, bending_model)
 

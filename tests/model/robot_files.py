@@ -1,4 +1,4 @@
-"""URDF files for tests: written from a few words, or random; and Pinocchio's view of them."""
+"""URDF files for tests, written from a few words or random; and their frames by Pinocchio."""
 
 import math
 
@@ -57,7 +57,7 @@ def two_links(content="", kind="revolute", **keywords):
 
 
 def random_robot(rng, links=8, content=INERTIAL):
-    """A random tree; links are in another order than its branches, so that parents come late."""
+    """A random tree; links are not in the order of its branches, so parents may follow children."""
 
     def three(scale=1.0):
         return " ".join(repr(float(x)) for x in scale * rng.standard_normal(3))
@@ -87,7 +87,7 @@ def values_of_all_joints(robot, q):
 
 
 def pinocchio_frames(path, values):
-    """Frames of all links, from the values of the joints that carry them."""
+    """Frames of all links, from the values of the joints that carry the links."""
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(path))
     data = model.createData()

@@ -33,20 +33,20 @@ def compare(robot, seed=0, batch=3):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_its_frames_are_those_of_the_robot(tmp_path, seed):
-    """Mimicking joints, links before their parents, and continuous joints among them."""
+def test_frames_of_a_chain_match_the_robot(tmp_path, seed):
+    """The robots include mimicking and continuous joints, and links before their parents."""
     path = save(tmp_path, random_robot(np.random.default_rng(seed)))
     compare(dc.Robot.load(path, actuation="position"), seed)
 
 
-def test_its_frames_are_those_of_the_gripper_and_the_panda():
+def test_frames_of_a_chain_match_the_gripper_and_the_panda():
     compare(dc.Robot.load(dc.robots.GRIPPER))
     path, root = panda()
     start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
     compare(dc.Robot.load(path, mesh_root=root, joint_positions=start))
 
 
-def test_its_jacobian_is_that_of_the_frames(tmp_path):
+def test_the_jacobian_of_a_chain_matches_its_frames(tmp_path):
     path = save(tmp_path, branch(np.random.default_rng(3)))
     arm = dc.Robot.load(path, actuation="position")
     serials = [pk.SerialChain(arm.chain, name, dtype=F64) for name in arm.link_names]
@@ -64,7 +64,7 @@ def test_its_jacobian_is_that_of_the_frames(tmp_path):
     torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-12)
 
 
-def test_it_has_the_limits_of_the_robot(tmp_path):
+def test_a_chain_has_the_limits_of_the_robot(tmp_path):
     parts = [
         *(link(name) for name in "abcd"),
         joint("j", "a", "b", limit='lower="-1" upper="2"'),
@@ -114,7 +114,7 @@ def inertials_of(robot):
 
 
 def test_a_robot_of_its_own_chain_is_the_same(tmp_path):
-    """But for the order of its links: the same steps, with what a chain drops given."""
+    """Up to the order of links, steps are equal if the data that a chain drops is given."""
     arm = dc.Robot.load(save(tmp_path, branch(np.random.default_rng(1))), actuation="torque")
     again = dc.Robot.from_chain(
         arm.chain, surfaces={}, inertials=inertials_of(arm), actuation="torque"
@@ -148,7 +148,7 @@ def test_a_chain_of_a_file_has_its_frames_in_single_precision(tmp_path):
         torch.testing.assert_close(turn @ turn.mT, torch.eye(3, dtype=F64), rtol=0, atol=1e-14)
 
 
-def test_its_surfaces_are_those_that_are_given(tmp_path):
+def test_a_robot_of_a_chain_has_the_given_surfaces(tmp_path):
     chain = pk.build_chain_from_urdf(robot(*two_links()).encode())
     box = dc.RigidBody.box(0.1)
     arm = dc.Robot.from_chain(
@@ -181,7 +181,7 @@ def test_its_surfaces_are_those_that_are_given(tmp_path):
         ({"base": "rolling"}, "`base` must be one of"),
     ],
 )
-def test_what_a_chain_lacks_is_named(options, message):
+def test_missing_data_of_a_chain_are_named(options, message):
     chain = pk.build_chain_from_urdf(robot(*two_links()).encode())
     with pytest.raises(dc.InvalidInput, match=message):
         dc.Robot.from_chain(chain, **{"surfaces": {}, "actuation": "position", **options})
@@ -208,7 +208,7 @@ def test_limits_of_efforts_and_speeds_are_those_of_the_chain():
         dc.Robot.from_chain(chain, surfaces={}, actuation="position")
 
 
-def test_what_is_no_chain_of_rigid_links_is_refused():
+def test_other_objects_than_chains_are_refused():
     with pytest.raises(TypeError, match=r"must be a pytorch_kinematics\.Chain, got str"):
         dc.Robot.from_chain("arm.urdf", surfaces={})
     chain = pk.build_chain_from_urdf(robot(*two_links()).encode())

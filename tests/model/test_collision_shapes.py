@@ -1,4 +1,4 @@
-"""Collision shapes of links: their meshes, where they are, and which files are read."""
+"""Collision shapes of links: meshes, poses, and accepted files."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,10 @@ def smallest_angle(vertices, faces):
 
 
 def is_manifold(faces):
-    """Every edge once in each direction, and all of it a sphere: V - E + F = 2."""
+    """Return whether each edge occurs once per direction and the surface is a sphere.
+
+    A sphere has V - E + F = 2.
+    """
     edges = {(a, b) for f in faces.tolist() for a, b in zip(f, f[1:] + f[:1], strict=True)}
     closed = len(edges) == 3 * len(faces) and all((b, a) in edges for a, b in edges)
     return closed and len(np.unique(faces)) - len(faces) / 2 == 2
@@ -56,9 +59,9 @@ def test_primitives_are_closed_with_edges_as_short_as_asked(tmp_path, name, edge
     assert is_manifold(faces)
     if edge_length is not None:
         assert longest_edge(vertices, faces) <= edge_length
-        # Not shorter than it must be: a factor of 2 from halving, the rest from whole numbers.
+        # Not much shorter than required: a factor of 2 from halving, the rest from rounding up.
         assert longest_edge(vertices, faces) > edge_length / 3
-    # Inscribed: 3 % of the volume is lost between 16 segments, a tenth of that between 50.
+    # Inscribed meshes: 16 segments lose 3 % of the volume, 50 segments a tenth of this.
     assert 0.8 < mass_properties(vertices, faces)[0] / volume < 1 + 1e-12
 
 
@@ -180,11 +183,11 @@ def test_packages_are_found_where_ros_finds_them(tmp_path, monkeypatch, variable
         surface(folder, geometry)
     monkeypatch.setenv(variable, f"/nowhere::{tmp_path / 'ws'}")
     assert len(surface(folder, geometry).faces) == 4
-    assert len(surface(folder, geometry, mesh_root=folder).faces) == 4  # it is a trusted folder
+    assert len(surface(folder, geometry, mesh_root=folder).faces) == 4  # a trusted folder
 
 
 def test_a_package_of_the_name_comes_before_other_folders(tmp_path):
-    """Two packages have a mesh of one name; the nearer one is not the one that is named."""
+    """Two packages have a mesh of one name; the nearer package is not the named one."""
     mesh_file(tmp_path / "mine" / "meshes")
     mesh_file(tmp_path / "other" / "meshes", mesh=(TETRAHEDRON[0], TETRAHEDRON[1][:3]))
     folder = tmp_path / "mine" / "urdf"

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings(
 EXAMPLES = "example-robot-data"
 AIRO, STRETCH = "airo-models", "hello-robot-stretch-urdf"
 
-# What each of them needs, beside the rules of URDF.
+# The ids name the requirement of each file beyond the rules of URDF.
 QUICK = [
     pytest.param(AIRO, "robotiq_2f_85.urdf", id="relative paths above the file"),
     pytest.param(AIRO, "wheel_brick.urdf", id="wheels"),
@@ -75,7 +75,7 @@ def test_forces_move_a_public_robot_under_a_cloth():
 @pytest.mark.slow
 @pytest.mark.parametrize(("package", "name"), QUICK)
 def test_meshes_are_where_pinocchio_places_them(package, name):
-    """Which files they are, their units, axes, scales and origins: the boxes of links agree."""
+    """Files, units, axes, scales and origins of meshes: the bounding boxes of links agree."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
     path = robot_file(package, name)
     robot = load(path, "position")
@@ -87,7 +87,7 @@ def test_meshes_are_where_pinocchio_places_them(package, name):
     for shape in geometry.geometryObjects:
         frame = model.frames[shape.parentFrame]
         if not hasattr(shape.geometry, "vertices"):
-            others.add(frame.name)  # boxes and the like, of which the tests of shapes know more
+            others.add(frame.name)  # primitive shapes, which other tests cover
             continue
         in_link = (frame.placement.inverse() * shape.placement).homogeneous
         vertices = np.array(shape.geometry.vertices())
@@ -107,7 +107,7 @@ def test_a_file_without_a_robot_is_refused():
 
 @pytest.mark.slow
 def test_a_public_file_is_refused_with_every_reason():
-    """Its fingers mimic joints that it does not have."""
+    """The file's fingers mimic joints that do not exist."""
     reasons = r"8 reasons:\n- <joint name='Left_index_q2'> <mimic>"
     with pytest.raises(dc.InvalidInput, match=reasons):
         load(robot_file(EXAMPLES, "alex_psyonic_hands.urdf"), "position")
@@ -116,7 +116,7 @@ def test_a_public_file_is_refused_with_every_reason():
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "least"), [("position", 130), ("default", 110)])
 def test_most_public_robots_load_and_step(mode, least):
-    """Of 138 files, and none that loads fails to step."""
+    """At least `least` of 138 files load, and every robot that loads steps."""
     paths = [path for package in PACKAGES for path in robot_files(package)]
     if len(paths) < 138:
         pytest.skip(f"needs the packages {', '.join(PACKAGES)}")

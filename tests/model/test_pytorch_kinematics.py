@@ -1,6 +1,6 @@
-"""What pytorch-kinematics does not do, next to what `Robot` makes of it.
+"""Limitations of pytorch-kinematics, and the corresponding behavior of `Robot`.
 
-Each test shows the gap first, so that one that a new version has closed is seen.
+Each test shows the limitation first, and therefore fails if a new version removes it.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ def chain(pk, text):
     return pk.build_chain_from_urdf(text.encode()).to(dtype=F64)
 
 
-def test_its_frames_are_of_single_precision(pk, tmp_path):
+def test_frames_are_of_single_precision(pk, tmp_path):
     path = save(tmp_path, ARM)
     robot = dc.Robot.load(path)
     q = np.array([0.3, 0.4])
@@ -48,7 +48,7 @@ def test_its_frames_are_of_single_precision(pk, tmp_path):
     assert np.abs(ours - expected).max() < 1e-15
 
 
-def test_its_second_derivatives_are_wrong(pk, tmp_path):
+def test_second_derivatives_are_wrong(pk, tmp_path):
     robot = dc.Robot.load(save(tmp_path, ARM))
     q = torch.tensor([0.3, 0.4], dtype=F64, requires_grad=True)
 
@@ -66,7 +66,7 @@ def test_its_second_derivatives_are_wrong(pk, tmp_path):
     assert torch.autograd.gradgradcheck(lambda q: robot.forward_kinematics(q)["c"], q)
 
 
-def test_it_drops_masses_shapes_and_mimics(pk, tmp_path):
+def test_masses_shapes_and_mimics_are_dropped(pk, tmp_path):
     shape = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
     mimic = '<mimic joint="j" multiplier="2"/>'
     text = robot(
@@ -83,21 +83,21 @@ def test_it_drops_masses_shapes_and_mimics(pk, tmp_path):
     assert [surface is None for surface in ours.surfaces] == [False, True, True]
 
 
-def test_it_needs_a_joint(pk, tmp_path):
+def test_a_chain_needs_a_joint(pk, tmp_path):
     text = robot(link("only"))
     with pytest.raises(UnboundLocalError):
         chain(pk, text)
     assert dc.Robot.load(save(tmp_path, text)).link_names == ("only",)
 
 
-def test_it_refuses_text_with_a_declaration(pk, tmp_path):
+def test_text_with_a_declaration_is_refused(pk, tmp_path):
     text = '<?xml version="1.0" encoding="utf-8"?>' + ARM
     with pytest.raises(ValueError, match="bytes"):
         pk.build_chain_from_urdf(text)
     assert dc.Robot.load(save(tmp_path, text)).joint_names == ("j", "k")
 
 
-def test_it_turns_nan_into_nan(pk, tmp_path):
+def test_a_nan_origin_makes_nan_frames(pk, tmp_path):
     text = robot(*two_links('<origin xyz="nan 0 0"/>'))
     theirs = chain(pk, text).forward_kinematics(torch.zeros(1, 1, dtype=F64))
     assert theirs["arm"].get_matrix().isnan().any()
@@ -122,14 +122,14 @@ def test_it_turns_nan_into_nan(pk, tmp_path):
         ),
     ],
 )
-def test_bad_files_crash_it(pk, tmp_path, text, error, message):
+def test_bad_files_crash_the_parser(pk, tmp_path, text, error, message):
     with pytest.raises(error):
         chain(pk, text)
     with pytest.raises(dc.InvalidInput, match=message):
         dc.Robot.load(save(tmp_path, text))
 
 
-def test_it_agrees_to_single_precision(pk, tmp_path):
+def test_frames_agree_to_single_precision(pk, tmp_path):
     """On trees without mimicking joints, as a second opinion."""
     rng = np.random.default_rng(5)
     text = random_robot(rng)

@@ -1,4 +1,4 @@
-"""The tables of quantities are those of the dataclasses, the core, the schema and the docs."""
+"""The tables of quantities agree with the dataclasses, the core, the schema and the docs."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def test_the_core_takes_what_the_tables_say():
     assert set(names) | set(DERIVED) == set(_core.input_names)
     assert not set(names) & set(DERIVED)
     assert len(_core.input_names) == len(set(_core.input_names))
-    # What a control leaves unset holds the state's, so that both may be the same input.
+    # An unset control holds the state's value, so control and state may share an input.
     twice = {name for name in names if names.count(name) > 1}
     assert twice == {"soft_pin_targets"}
 
 
 def test_names_of_options_come_from_the_core():
-    """Schemes, metrics and solvers are said once; couplings, which live in Python, too."""
+    """Schemes, metrics and solvers are listed once, in the core; couplings once, in Python."""
     assert _core.schemes.keys() == {"coupled", "split", "projective"}
     assert tuple(_core.schemes) == options.SCHEMES
     section = schema.SimulationSection
@@ -138,7 +138,7 @@ def test_docstrings_say_the_range(name):
         assert ">" not in entry
 
 
-# Nothing depends on the time, which has no letter.
+# The time has no letter, because no quantity depends on it.
 @pytest.mark.parametrize(("kind", "quantity"), [e for e in EVERY if e.id != "State.time"])
 def test_the_notation_has_unit_and_shape(kind, quantity):
     rows = [line.split("|") for line in NOTATION.read_text().splitlines() if line[:2] == "| "]
@@ -175,7 +175,7 @@ def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value
         sim.step(sim.initial_state(), None, sim.default_parameters().replace(**{name: wrong}))
     for owner, field in sources(name):
         if (owner, field) in (("Robot", "mechanism"), ("Robot", "viscosity")):
-            continue  # a file says them
+            continue  # values of the file
         # A body without mass is none.
         range_there = re.escape(str(POSITIVE)) if field == "mass" else accepted
         with pytest.raises(dc.InvalidInput, match=rf"`{field}` must be {range_there}"):
@@ -187,7 +187,7 @@ def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value
 
 
 def sources(name):
-    """Class and field of each source of a parameter; none where it is zero by default."""
+    """Class and field of each source of a parameter; none if the default is zero."""
     source = PARAMETERS[name].source
     return [] if source == "zero" else [tuple(s.split(".")) for s in source.split(", ")]
 

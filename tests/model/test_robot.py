@@ -30,7 +30,7 @@ from diffcloth_torch.model.defaults import has_contact, scene_parameters
 ROOT = Path(__file__).resolve().parents[2]
 F64 = torch.float64
 
-# Both sides multiply up to ten rotations of unit size and offsets below 3 m.
+# Both sides multiply up to ten rotations and offsets below 3 m.
 FRAMES = {"rtol": 0, "atol": 1e-12}
 
 
@@ -148,7 +148,7 @@ def test_frames_have_exact_first_and_second_derivatives(tmp_path):
     robot = dc.Robot.load(save(tmp_path, random_robot(np.random.default_rng(1))), actuation="pd")
     rng = torch.Generator().manual_seed(0)
     q = torch.randn(len(robot.joint_names), dtype=F64, generator=rng)
-    q[0] = 0.0  # where an exponential by a division is not smooth
+    q[0] = 0.0  # an exponential computed by a division is not smooth at zero
     pose = torch.tensor([0.1, 0.2, 0.3, 1.1, 0.2, -0.4, 0.3], dtype=F64)
     inputs = (q.requires_grad_(), pose.requires_grad_())
 
@@ -260,7 +260,7 @@ def test_continuous_joints_have_no_limits(tmp_path):
 
 
 def test_links_that_touch_by_construction_are_ignored(tmp_path):
-    """Those joined by one moving joint, once links that fixed joints join count as one."""
+    """Links joined by one moving joint, if links with fixed joints between them count as one."""
     box = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
     names = ["base", "flange", "bare", "arm", "tool", "hand"]
     robot = load(
@@ -293,7 +293,7 @@ def test_links_that_touch_by_construction_are_ignored(tmp_path):
     }
 
 
-# --- What moves by forces -------------------------------------------------------------------------
+# --- Links that forces move -----------------------------------------------------------------------
 
 NO_MASS = '<inertial><mass value="0"/></inertial>'
 
@@ -313,7 +313,7 @@ def inertial(ixx, iyy, izz, ixy=0.0, mass=1.0):
         pytest.param(inertial(1, 1, 3), "above the sum of the other two", id="triangle"),
     ],
 )
-def test_what_forces_move_needs_an_inertia(tmp_path, content, message):
+def test_links_that_forces_move_need_an_inertia(tmp_path, content, message):
     parts = [link("base", ""), link("arm", content), joint("hinge", "base", "arm")]
     with pytest.raises(dc.InvalidInput, match=rf"'arm'> <inertial>: .*{message}"):
         load(tmp_path, *parts, actuation="torque")
@@ -347,7 +347,7 @@ def test_a_joint_with_one_position_is_prescribed_unless_told(tmp_path):
 
 
 def test_links_that_fixed_joints_join_have_one_inertia(tmp_path):
-    """A point of mass is no body alone, but it may be a part of one."""
+    """A point mass alone is no body, but may be a part of a body."""
     parts = [link("base", ""), joint("hinge", "base", "arm")]
     point = '<inertial><mass value="1"/></inertial>'
     weld = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 1"/>')
@@ -508,7 +508,7 @@ def test_zero_in_a_file_is_no_limit(tmp_path):
 
 
 def test_joints_that_mimic_count_by_virtual_work(tmp_path):
-    """They move m times as far, so their efforts count |m| times, and their speed 1/|m|."""
+    """Mimics move m times as far: efforts count |m| times, and speed limits 1/|m| times."""
     parts = [
         *(link(name) for name in ("base", "arm", "hand", "tip", "nail")),
         joint("hinge", "base", "arm", content=BOUNDED, limit=""),
@@ -634,7 +634,7 @@ def test_a_robot_pickles():
     np.testing.assert_array_equal(again.stiffness, robot.stiffness)
 
 
-# --- Robots that come along -----------------------------------------------------------------------
+# --- Robots of the package ------------------------------------------------------------------------
 
 
 def test_the_gripper_is_what_its_script_makes():

@@ -1,4 +1,4 @@
-"""The URDF reader: what is refused, by file and element; and that no bytes get past it."""
+"""The URDF reader: refused files with their element; random bytes never crash the reader."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -167,7 +167,7 @@ def test_a_chain_of_mimics_must_end(tmp_path):
 
 
 def test_mimics_are_read_as_urdfdom_reads_them(tmp_path):
-    """A mimicking joint needs no limit of its own; a fixed joint mimics nothing."""
+    """A mimicking joint needs no limit; a fixed joint mimics nothing."""
     parts = [link(name) for name in "abcd"]
     mimic = '<mimic joint="j" multiplier="2"/>'
     joints = [
@@ -198,7 +198,7 @@ def test_names_may_contain_a_slash(tmp_path):
     assert robot.joint_names == ("k", "k/c")
     scene = dc.Scene([dc.Cloth.grid(2, 2)], robots=[robot])
     assert scene.surface_names == ("cloth0", "r/a/b")
-    # In a chain the joint of c, which mimics k, has a name of its own.
+    # In a chain the joint of c, which mimics k, has a separate name.
     assert len(robot.chain_positions(torch.zeros(2, dtype=torch.float64))) == 3
 
 
@@ -294,7 +294,7 @@ def test_links_that_are_no_tree_are_refused(tmp_path, parts, message):
 
 
 def test_a_long_chain_is_no_problem(tmp_path):
-    """It is deeper than Python recurses."""
+    """The chain is deeper than Python's recursion limit."""
     n = 3000
     links = [link(f"l{i}", "") for i in range(n)]
     joints = [joint(f"j{i}", f"l{i}", f"l{i + 1}", "fixed") for i in range(n - 1)]
@@ -302,7 +302,7 @@ def test_a_long_chain_is_no_problem(tmp_path):
     assert len(description.joints) == n - 1
 
 
-def test_what_is_not_read_is_left_out(tmp_path, capfd):
+def test_unread_elements_are_ignored_silently(tmp_path, capfd):
     extra = '<material name="m"/><gazebo><a/></gazebo><transmission name="t"/>'
     odd = '<dynamics damping="1" D="2"/><safety_controller k_velocity="1"/><calibration/>'
     visual = "<visual><geometry><teapot/></geometry></visual>"

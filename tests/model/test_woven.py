@@ -1,4 +1,4 @@
-"""Woven cloth as a part of a scene: its directions, which parameters it has, what is refused."""
+"""Woven cloth in a scene: directions, parameters and refused values."""
 
 import dataclasses
 import pickle
@@ -64,7 +64,7 @@ def test_the_warp_is_what_lies_along_x_unless_said_otherwise():
 
 
 def test_directions_belong_to_the_material():
-    """Another rest shape, turned in its plane, takes them along; the cloth does not notice."""
+    """A rest shape rotated in its plane rotates the directions too; the motion is unchanged."""
     sheet = cloth()
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)
     c, s = np.cos(0.7), np.sin(0.7)
@@ -90,7 +90,7 @@ def test_equal_numbers_are_an_isotropic_cloth_bit_for_bit(scheme):
 @pytest.mark.parametrize("metric", ["energy", "elastic", "mass", "identity"])
 @pytest.mark.parametrize("elastic", ["newton", "projective"])
 def test_local_global_iterations_reach_the_minimizer_of_newton(metric, elastic):
-    """Also where shear is stiffer than the yarns, beyond what the constant form bounds."""
+    """This includes shear stiffer than the yarns, which the constant form does not bound."""
     material = dc.Material(**WOVEN | {"stretch_shear": 900.0})
     options = {"tolerance": 1e-9, "max_iterations": 5000}
     reference = fallen(cloth(material), scheme="split", solver=dc.SolverOptions(**options))

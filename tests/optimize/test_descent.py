@@ -20,7 +20,7 @@ def leaf(*values):
 
 
 def state_of(values, statuses=None):
-    """A state whose positions [B, 1, 1] are the values of environments, some of which failed."""
+    """A state with the environments' values as positions [B, 1, 1]; some environments failed."""
     batch = len(values)
     statuses = statuses or ["converged"] * batch
     numbers = torch.zeros(batch)
@@ -40,7 +40,7 @@ def state_of(values, statuses=None):
 
 
 def bowl(reach=math.inf, name="a"):
-    """Environments at the values of a variable; those beyond a reach fail."""
+    """Simulation that returns a variable's values as state; values beyond `reach` fail."""
 
     def simulate(variables):
         values = variables[name]
@@ -72,7 +72,7 @@ OPTIMIZERS = [
 
 @pytest.mark.parametrize("make", OPTIMIZERS)
 def test_the_loop_is_that_of_the_optimizer(make):
-    """With the same bits as without us."""
+    """The bits equal a plain loop of the optimizer."""
     a = leaf(1.0, -2.0)
     found = dc.descend(bowl(), total, {"a": a}, make, iterations=5)
     b = leaf(1.0, -2.0)
@@ -120,7 +120,7 @@ def test_an_optimizer_with_groups_of_its_own_is_taken():
         ({"loss": lambda s: total(s) / 0}, dc.SimulationError, "the loss is inf: a gradient"),
     ],
 )
-def test_what_does_not_fit_is_refused(arguments, error, message):
+def test_bad_arguments_are_refused(arguments, error, message):
     accepted = {
         "simulate": bowl(),
         "loss": total,
@@ -136,7 +136,7 @@ def test_what_does_not_fit_is_refused(arguments, error, message):
 
 
 def test_a_failed_status_fails_the_attempt_where_the_loss_is_one_number():
-    # As in tests/tasks: the first step leads from 1 to -9; -4 fails as well, -1.5 is tried.
+    # The first step leads from 1 to -9; -4 fails as well, -1.5 succeeds (also in tests/tasks).
     far = partial(torch.optim.SGD, lr=5.0)
     found = dc.descend(bowl(reach=2.0), total, {"a": leaf(1.0)}, far, iterations=2)
     assert found.metrics()["losses"] == [1.0, 1.5**2]
@@ -146,8 +146,8 @@ def test_a_failed_status_fails_the_attempt_where_the_loss_is_one_number():
 
 
 @pytest.mark.parametrize("make", OPTIMIZERS)
-def test_what_the_optimizer_has_gathered_is_dropped_where_an_attempt_failed(make):
-    """From the place half way back it goes on as a loop that starts there."""
+def test_the_state_of_an_optimizer_is_dropped_after_a_failed_attempt(make):
+    """From the point half way back, the loop continues as a loop that starts there."""
     seen = []
     fails = iter([False, False, True, False, False])
 
@@ -170,7 +170,7 @@ def test_a_failure_at_the_start_is_raised():
 
 
 def test_failed_environments_are_left_out_of_a_loss_for_each():
-    """A variable that all share follows the mean of those that are left."""
+    """A shared variable follows the mean over the remaining environments."""
     shift = leaf(0.5)
     starts = torch.tensor([0.0, 1.0, 9.0], dtype=F64)
     simulate = bowl(reach=5.0, name="values")
@@ -191,7 +191,7 @@ def test_failed_environments_are_left_out_of_a_loss_for_each():
 
 
 def test_a_smaller_loss_of_fewer_environments_is_not_better():
-    # The third environment fails from the second evaluation on, the mean of the others is less.
+    # From the second evaluation on the third environment fails; the others' mean is smaller.
     starts = torch.tensor([0.0, 1.0, 9.0], dtype=F64)
     reaches = iter([99.0, 5.0, 5.0])
 
@@ -207,17 +207,17 @@ def test_a_smaller_loss_of_fewer_environments_is_not_better():
 def test_an_attempt_of_which_no_environment_is_left_goes_back():
     far = partial(torch.optim.SGD, lr=5.0)
     found = dc.descend(bowl(reach=2.0), squares, {"a": leaf(1.0, 1.0)}, far, iterations=2)
-    # Of the mean of two, each gets half of the gradient: 1 - 5 = -4, then -1.5.
+    # Each of the two gets half of the mean's gradient: 1 - 5 = -4, then -1.5.
     assert found.metrics()["losses"] == [1.0, 1.5**2]
 
 
-# --- environments of their own --------------------------------------------------------------------
+# --- Independent environments ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", OPTIMIZERS)
 @pytest.mark.parametrize("options", [{}, {"clip": 0.7, "restart": True}])
-def test_each_environment_goes_its_own_way(make, options):
-    """As if it were alone, in all that happens to it: clip, restart, its loss."""
+def test_environments_descend_independently(make, options):
+    """Clipping, restarts and losses of an environment are independent of the others."""
     starts = [1.0, -2.0, 0.1]
     together = leaf(*starts)
     options = {"iterations": 8, "per_environment": ["a"], **options}
@@ -251,7 +251,7 @@ def test_an_environment_that_failed_goes_back_half_way_and_the_others_go_on():
     found = dc.descend(simulate, squares, {"a": both}, far, **options)
     dc.descend(bowl(reach=2.0), squares, {"a": good}, far, **options)
     assert torch.equal(both[0], good[0])
-    # 1.9 - 1.2 * 3.8 = -2.66 fails; half way to 1.9 is -0.38, from where it goes without momentum.
+    # 1.9 - 1.2 * 3.8 = -2.66 fails; half way to 1.9 is -0.38, a restart without momentum.
     rows = [values[1].item() for values in seen]
     assert rows[1] == pytest.approx(-2.66)
     assert rows[2] == pytest.approx(-0.38)
@@ -262,7 +262,7 @@ def test_an_environment_that_failed_goes_back_half_way_and_the_others_go_on():
 
 
 def test_the_best_rows_are_those_of_the_smallest_losses():
-    """Steps that are too long for the last environment, whose loss rises."""
+    """The steps are too long for the last environment, whose loss rises."""
     rates = torch.tensor([0.9, 1.6, 2.3], dtype=F64)
     x = leaf(0.0, 0.0, 0.0)
     seen = []
@@ -312,7 +312,7 @@ def test_rows_must_be_those_of_the_environments():
 @pytest.mark.parametrize("make", OPTIMIZERS)
 @pytest.mark.parametrize("per_environment", [[], ["a"]])
 def test_a_loop_goes_on_with_the_same_bits(make, per_environment, tmp_path):
-    """With its optimizer, its random numbers, and what it knows of each environment."""
+    """A resumed loop restores the optimizer, random numbers and records of each environment."""
 
     def run(variables, iterations, **options):
         def simulate(v):
@@ -346,7 +346,7 @@ def test_a_loop_goes_on_with_the_same_bits(make, per_environment, tmp_path):
     assert len(found.history) == 4
 
 
-def test_torchs_own_random_numbers_go_on_too():
+def test_random_numbers_of_torch_are_resumed():
     def run(iterations, found=None):
         simulate = lambda v: [state_of(v["a"] + torch.randn(1, dtype=F64))]  # noqa: E731
         return dc.descend(
@@ -361,7 +361,7 @@ def test_torchs_own_random_numbers_go_on_too():
     assert torch.equal(run(6, half).next_variables["a"], whole.next_variables["a"])
 
 
-def test_what_was_reported_does_not_change_afterwards():
+def test_reported_results_do_not_change_afterwards():
     reports = []
     dc.descend(bowl(), total, {"a": leaf(1.0)}, ADAM, iterations=3, report=reports.append)
     assert [len(found.history) for found in reports] == [1, 2, 3]
@@ -378,7 +378,7 @@ def hanging(**options):
 
 
 def test_parameters_starts_and_weights_are_found():
-    """What made a rollout is found again from its end: all leaves of a graph are alike."""
+    """Inputs of a rollout are recovered from its end: all leaves of a graph are equivalent."""
     simulator = hanging()
     network = torch.nn.Linear(3, 3, dtype=F64)
     truth = {"log_stretch": math.log(60.0), "lift": 0.4}
@@ -416,7 +416,7 @@ def test_parameters_starts_and_weights_are_found():
 
 
 def test_a_batch_of_a_simulator_whose_environments_fail():
-    """One of three pushes its pins into a floor; it goes back, and no gradient comes from it."""
+    """One of three environments pushes its pins into a floor, goes back and has no gradient."""
     cloth = dc.Cloth.grid(3, 3, 0.2, pins={"all": range(9)}, pose=[0, 0, 0.1, 1, 0, 0, 0])
     scene = dc.Scene([cloth], [dc.RigidBody.plane(2.0)])
     simulator = dc.Simulator(scene, 0.01, solver=dc.SolverOptions(throw=False))
@@ -443,4 +443,4 @@ def test_a_batch_of_a_simulator_whose_environments_fail():
     assert any(record["environment_losses"][2] is None for record in found.history)
     assert all(record["environment_losses"][:2] != [None, None] for record in found.history)
     assert found.best_losses[:2].max() < 1e-6
-    assert 0.05 < found.best_rows["down"][2] < 0.1  # as low as there is room
+    assert 0.05 < found.best_rows["down"][2] < 0.1  # the lowest feasible position

@@ -1,4 +1,4 @@
-"""Fits: what they find from data of their own, how sure they are, and what they refuse."""
+"""Fits: results from synthetic data, confidence intervals and refused input."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def rollout(sim, parameters, steps=12):
 
 
 def complete(sim, parameters):
-    """Parameters of the scene with those of a fit in their places."""
+    """Parameters of the scene, with the parameters of a fit replaced."""
     given = {n: v for n, v in vars(parameters).items() if isinstance(v, torch.Tensor)}
     return sim.default_parameters().replace(**given)
 
@@ -63,7 +63,7 @@ START = {"stretch": dc.Variable(30.0), "bending": dc.Variable(2e-4)}
 @pytest.mark.slow
 @pytest.mark.rounding
 def test_the_true_values_are_in_their_intervals(strip):
-    """In nearly all of ten seeds; the fit is that of SciPy with differences."""
+    """The intervals hold for nearly all of ten seeds; the fit equals SciPy's with differences."""
     hits = dict.fromkeys(TRUTH, 0)
     for seed in range(10):
         found = dc.fit(START, residuals_of(strip, observe(strip, seed, **TRUTH)))
@@ -74,7 +74,7 @@ def test_the_true_values_are_in_their_intervals(strip):
             low, high = found.intervals[name]
             hits[name] += low <= true <= high
             assert low < float(found.values[name]) < high < 3 * low
-    assert all(count >= 8 for count in hits.values()), hits  # 95 % of ten, less what chance takes
+    assert all(count >= 8 for count in hits.values()), hits  # 95 % of ten, less chance
 
 
 @pytest.mark.rounding
@@ -112,8 +112,8 @@ def test_the_jacobian_is_that_of_differences(strip):
     assert abs(found.correlation[0, 1]) < 1.0
 
 
-def test_what_acts_as_a_ratio_cannot_be_told_apart(strip):
-    """At rest a stretched strip knows stiffness over weight alone."""
+def test_parameters_that_act_as_a_ratio_cannot_be_separated(strip):
+    """A stretched strip at rest depends only on the ratio of stiffness to weight."""
     sim = hanging()
     with torch.no_grad():
         target = sim.equilibrium(sim.initial_state()).positions.numpy()[None]
@@ -136,7 +136,7 @@ def test_what_acts_as_a_ratio_cannot_be_told_apart(strip):
     assert "stretch" in str(found.unidentifiable[0])
 
 
-def test_nothing_is_known_of_what_residuals_do_not_use():
+def test_nothing_is_known_of_variables_that_residuals_do_not_use():
     found = dc.fit(START, lambda p: torch.stack([p.stretch / 50 - 1, p.stretch / 52 - 1]))
     assert 50 < float(found.values["stretch"]) < 52
     assert found.intervals["bending"] == (0.0, np.inf)
@@ -372,7 +372,7 @@ def test_bad_input(call, error, message):
     ],
 )
 def test_residuals_that_leave_torch_are_refused(strip, method, count, leave, message):
-    """With what torch says of it as the cause, and never with a derivative of zero."""
+    """The error has torch's error as its cause; a derivative of zero never results."""
 
     def residuals(parameters):
         state = rollout(strip, complete(strip, parameters), steps=2)[-1]
@@ -382,7 +382,7 @@ def test_residuals_that_leave_torch_are_refused(strip, method, count, leave, mes
         dc.fit(START, residuals, method=method, max_evaluations=2)
 
 
-def test_other_errors_of_residuals_are_their_own():
+def test_other_errors_of_residuals_are_raised_unchanged():
     def residuals(parameters):
         if torch._C._are_functorch_transforms_active():
             raise RuntimeError("my own")

@@ -78,7 +78,7 @@ def test_any_number_of_workers_finds_the_same_bits():
     assert bits(dc.fit(VARIABLES, residuals, starts=4, seed=3, workers=2)) == bits(alone)
 
 
-def test_what_cannot_be_sent_to_a_process_is_refused():
+def test_residuals_that_cannot_be_pickled_are_refused():
     with pytest.raises(dc.InvalidInput, match="`residuals` must be a function of a module"):
         dc.fit(VARIABLES, lambda p, v: residuals(p, v), workers=1)
 
@@ -134,7 +134,7 @@ def test_a_stage_keeps_what_it_does_not_free_and_the_next_begins_there():
 
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
-def test_what_is_held_out_is_not_fitted_and_its_error_is_that_of_the_noise():
+def test_held_out_data_are_not_fitted_and_their_error_is_the_noise():
     found = dc.fit(VARIABLES, residuals, hold_out=kept_out)
     assert len(found.residuals) == 20
     (error,) = found.held_out
@@ -260,7 +260,7 @@ class TestOutline:
         found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, torch.from_numpy(rays))
         np.testing.assert_allclose(found.numpy(), radii, atol=1e-9)
 
-    def test_it_is_the_last_crossing_and_its_derivative_is_that_of_differences(self):
+    def test_a_radius_is_the_last_crossing_and_its_derivative_matches_differences(self):
         points = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
         pairs = np.array([(i, j) for i in range(30) for j in range(i)])
         found = _radii("", points, pairs, torch.from_numpy(self.RAYS))
@@ -290,7 +290,7 @@ class TestOutline:
 
     @pytest.mark.parametrize("phase", [0.0, 0.4, 1.7, 3.0, 5.0])
     def test_a_turned_outline_is_turned_back(self, phase):
-        """Among the three turns that agree with the largest wave, the others tell the right one."""
+        """Three rotations fit the largest wave; the other waves determine the right rotation."""
         sizes = {1: 0.002, 3: 0.01, 4: 0.004}
         cloth, state, _ = self.wavy(0.0, sizes)
         *_, seen = self.wavy(phase, sizes)
@@ -298,7 +298,7 @@ class TestOutline:
         with noting() as notes:
             found = dc.residuals.outline([state], [seen], turned=True, **call)
         assert float(found.abs().max()) < 5e-5
-        # What was seen lies in the scene of the state, on the rim of the wheel there.
+        # The placed observation is in the scene of the state, on the rim of its wheel.
         rim = dc.residuals.outline([state], notes[0].placed, **call)
         assert float(rim.abs().max()) < 5e-4
         plain = dc.residuals.outline([state], notes[0].observed, **call)

@@ -1,4 +1,4 @@
-"""What fits say of their certainty, and what ends a trial and not the fit."""
+"""Reported uncertainties of fits, and failures that end a trial but not the fit."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_torch_optimizer_goes_back_from_any_failure_and_resumes_with_the_same_
     assert float(first.values["b"]) == pytest.approx(3.0, abs=0.15)
     count = len(rates)
     again = dc.fit(variables(), too_large, **options)
-    assert len(rates) == count + 1  # what is kept is tried once
+    assert len(rates) == count + 1  # the kept point is tried once
     assert again.message == first.message
     assert [t.cost for t in again.history] == [t.cost for t in first.history]
     assert {n: v.tolist() for n, v in again.values.items()} == {

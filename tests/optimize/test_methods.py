@@ -1,4 +1,4 @@
-"""Solvers of fits: all end where least squares does, in a problem that needs no simulation."""
+"""Solvers of fits agree with least squares, on a problem without simulation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_other_methods_end_at_the_same_place(name):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
-def test_they_stay_within_bounds(name):
+def test_methods_stay_within_bounds(name):
     """The best offset is near -.3."""
     free = VARIABLES | {"offset": dc.Variable(0.0, bounds=(-0.1, 1))}
     found = dc.fit(free, residuals, **METHODS[name])
@@ -43,7 +43,7 @@ def test_they_stay_within_bounds(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_they_go_on_with_the_same_bits(name, tmp_path):
+def test_methods_resume_with_the_same_bits(name, tmp_path):
     options = METHODS[name] | {"max_evaluations": 12, "resume": tmp_path}
     count = 0
 
@@ -78,7 +78,7 @@ def fails_beyond(limit):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_failure_is_a_rejected_trial_and_counted(name):
-    """The best rate is 2; steps that go further than 2.05 fail."""
+    """The best rate is 2; trial points beyond 2.05 fail."""
     quick = {"Adam": {"method": partial(torch.optim.Adam, lr=0.1), "max_evaluations": 40}}
     found = dc.fit(VARIABLES, fails_beyond(2.05), **(METHODS | quick)[name])
     assert found.failures > 0
@@ -88,7 +88,7 @@ def test_a_failure_is_a_rejected_trial_and_counted(name):
 
 
 def woven(twill):
-    """Residuals that vanish at a twill of 1.5e-4; from 1.92e-4 on it belongs to a material."""
+    """Residuals of a twill stiffness that is valid for a material from 1.92e-4 on."""
     material = dc.Material(
         bending=4e-4, bending_weft=2e-4, bending_twill=twill, poisson=0.3, density=0.2
     )
@@ -106,7 +106,7 @@ def woven(twill):
 
 @pytest.mark.parametrize("method", ["least_squares", "L-BFGS-B", partial(torch.optim.Adam, lr=0.2)])
 def test_a_trial_step_beyond_all_materials_is_rejected(method):
-    """No bounds keep it out, which is no reason to end the fit."""
+    """Without bounds a trial may leave the valid range; the fit continues."""
     variables = {"bending_twill": dc.Variable(5e-4)}
     found = dc.fit(variables, woven(5e-4), method=method, max_evaluations=40)
     assert found.failures > 0

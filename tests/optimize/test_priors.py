@@ -1,4 +1,4 @@
-"""Priors of fits: against the formula of linear regression, and what is refused."""
+"""Priors of fits: against the formula of linear regression, and refused priors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def product(parameters, values):
 
 
 def test_a_prior_decides_where_observations_do_not():
-    """One number says a b = 6; the prior of a, on the scale "log", says the rest."""
+    """One observation determines a b = 6; the prior of a, on the scale "log", determines a."""
     free = {
         "a": dc.Variable(1.0, scale="log", prior=(2.0, 0.1)),
         "b": dc.Variable(1.0, scale="log"),

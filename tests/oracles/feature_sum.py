@@ -1,6 +1,6 @@
 """The energy of contact as a plain sum over every feature of every surface, with ipctk's distances.
 
-No candidates, no merging, no classification: what the core's sums must add up to.
+Without candidates, merging and classification: the reference for the core's sums.
 """
 
 import collections
@@ -91,7 +91,7 @@ def area(a, b, c):
 
 
 def distance_sq(p, q):
-    """Of two edges or points."""
+    """Squared distance between two edges or points."""
     if len(p) == 2 and len(q) == 2:
         return ipctk.edge_edge_distance(*p, *q)
     if len(p) == len(q):
@@ -100,7 +100,7 @@ def distance_sq(p, q):
 
 
 class FeatureSum:
-    """Sum over features; the sharpness and the areas of a body's features are those of the core."""
+    """Sum over features; sharpness and areas of a body's features come from the core."""
 
     def __init__(self, scene):
         self.scene = scene
@@ -145,13 +145,13 @@ class FeatureSum:
         return self.kappa[s, r] * kernels.barrier(d_sq, xi, self.scene.d_hat)
 
     def counted_faces(self, s, p):
-        """Those that point p sees; if it is prescribed, of a cloth those with a free vertex."""
+        """Faces of s that act on point p; for prescribed p, a cloth's faces with a free vertex."""
         if s >= self.scene.cloth_count or not self.scene.prescribed[p]:
             return self.faces[s]
         return [f for f in self.faces[s] if not self.scene.prescribed[list(f)].all()]
 
     def is_still(self, s):
-        """Whether a body is prescribed."""
+        """Return whether a body is prescribed."""
         return self.scene.prescribed[self.faces[s][0][0]]
 
     def point_against(self, x, p, s, r):
@@ -225,7 +225,7 @@ class FeatureSum:
         return total
 
     def skeleton(self, s):
-        """The one or two ends of a round body, and its area, that of an end and of the axis."""
+        """Ends (one or two) of a round body, its area, and the areas of an end and of the axis."""
         ends = sorted(set(self.faces[s][0]))
         length = np.linalg.norm(self.scene.X[ends[-1]] - self.scene.X[ends[0]])
         whole = 2 * np.pi * self.radius[s] * (2 * self.radius[s] + length)
@@ -233,7 +233,7 @@ class FeatureSum:
         return ends, *np.float32(areas).astype(float)
 
     def cloth_against_round(self, x, s, r):
-        """A quarter of every area, against the ends or, where it is nearer, the axis."""
+        """A quarter of every area, against the ends or, if nearer, the axis."""
         scene = self.scene
         ends, *_ = self.skeleton(r)
         total = 0.0
@@ -273,7 +273,7 @@ class FeatureSum:
             return self.between_round(x, r, s)
 
         def against(ends, other, corner, most):
-            """Ends as corners of one, against all of the other."""
+            """Ends of one body as corners, against the whole other body."""
             sums = [self.barrier(distance_sq(x[[p]], x[other]), s, r) for p in ends]
             return 0.25 * min(corner, most) * sum(sums)
 
@@ -301,7 +301,7 @@ class FeatureSum:
             if not area:
                 continue
             inner = 0.0
-            # Each edge as a whole, less half of each end where another edge continues it.
+            # Each whole edge, less half of each end at which another edge continues.
             for p, share_p in self.parts(c):
                 for q, share_q in self.parts(e):
                     d_sq = distance_sq(x[p], x[q])

@@ -1,7 +1,7 @@
 """Distance to simple solids by brute force: the nearest of many points of the surface.
 
-Slow, obvious, and independent of the formulas of the core. The surfaces are given by charts of two
-parameters, which are searched on ever finer grids around the best point so far.
+This is slow, obvious, and independent of the core's formulas. Surfaces are given by charts of two
+parameters; the search refines a grid around the best point so far.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ Chart = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def sphere(radius):
-    """One chart over the unit square, and whether a point is inside."""
+    """One chart over the unit square, and a predicate for points inside."""
 
     def chart(s, t):
         a, b = np.pi * s, 2 * np.pi * t

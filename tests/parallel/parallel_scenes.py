@@ -1,4 +1,4 @@
-"""Folded sheets on a plate, in contact with it and with themselves from the first step on."""
+"""Folded sheets on a plate, in contact with the plate and themselves from the first step on."""
 
 from functools import cache
 
@@ -18,9 +18,9 @@ def simulator(n, scheme="coupled", folded=True, woven=False):
     edge = 1.0 / (n - 1)
     flat = np.array(sheet.vertices)
     flat[:, :2] += np.random.default_rng(n).uniform(-0.1, 0.1, (n * n, 2)) * edge
-    s = flat[:, 1]  # across the fold, which takes one row of cells
+    s = flat[:, 1]  # across the fold, which occupies one row of cells
     reach = 0.1 * edge
-    # Deeper in the barrier it is 90 iterations that end this step, in place of 50.
+    # Deeper in the barrier this step needs 90 iterations instead of 50.
     gap, below = 0.95 * reach, s < (0.0 if folded else 1.0)
     placed = np.stack([flat[:, 0], np.where(below, s, -s), np.where(below, 0, gap)], axis=-1)
     material = dc.fabrics.material("blanket") if woven else dc.Material(friction=0.3)
@@ -33,7 +33,7 @@ def simulator(n, scheme="coupled", folded=True, woven=False):
 
 
 def batch(n, environments, seed=0, scheme="coupled", folded=True, woven=False):
-    """A state whose environments differ in their velocities."""
+    """A batched state with different velocities in each environment."""
     state = simulator(n, scheme, folded, woven).initial_state(environments)
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(state.velocities.shape, generator=generator, dtype=F64)
@@ -42,7 +42,7 @@ def batch(n, environments, seed=0, scheme="coupled", folded=True, woven=False):
 
 
 def step(sim, state):
-    """One step; values after it and the gradients of all inputs that a step of a state has."""
+    """One step: its values, and the gradients by the state, body poses and friction."""
     before = state.detach()
     leaves = [before.positions.clone(), before.velocities.clone(), before.body_poses.clone()]
     x, v, poses = (leaf.requires_grad_() for leaf in leaves)
@@ -61,6 +61,6 @@ def step(sim, state):
 
 
 def differing(a, b):
-    """Names of the values whose bits differ."""
+    """Names of values with different bits."""
     names = ("positions", "velocities", "body_forces", "x_bar", "v_bar", "poses_bar", "mu_bar")
     return [name for name, p, q in zip(names, a, b, strict=True) if not torch.equal(p, q)]

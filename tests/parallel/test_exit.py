@@ -3,7 +3,7 @@
 import pytest
 from processes import run_python
 
-# What a thread repeats; the main thread ends at once, or after a while.
+# Program whose thread repeats steps; the main thread ends at once, or after a while.
 _SCRIPT = """
     import sys, threading, time
     import torch

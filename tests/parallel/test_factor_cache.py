@@ -1,4 +1,4 @@
-"""Factors are kept for backward up to a number of bytes, and made again where they are gone."""
+"""Factors are kept for backward up to a number of bytes, and recomputed if evicted."""
 
 import gc
 import weakref
@@ -22,7 +22,7 @@ def test_factors_are_kept_up_to_a_number_of_bytes():
         sizes.append(core.factor_bytes)
         assert 0 < sizes[-1] <= largest
         assert len(sizes) < 1000
-    # It was full, and held as many as there was room for.
+    # The cache was full and held as many factors as fit.
     assert sizes[-1] > largest - sizes[0] - 1
     core.forget_factors()
     assert core.factor_bytes == 0
@@ -52,7 +52,7 @@ def test_a_graph_may_outlive_its_simulator():
     after.positions.sum().backward()
 
 
-def test_what_is_kept_may_outlive_the_core():
+def test_kept_factors_may_outlive_the_core():
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(5, 5)]), 0.01)
     inputs, _ = sim._inputs(sim.initial_state(), None, None)
     arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
@@ -62,7 +62,7 @@ def test_what_is_kept_may_outlive_the_core():
     del sim
     gc.collect()
     assert simulator() is None
-    del kept  # gives its place back to a cache that is gone
+    del kept  # returns its bytes to a cache that no longer exists
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
@@ -87,5 +87,5 @@ def test_contacts_that_come_and_go_seldom_cost_an_analysis():
         sum(int(c[name].sum()) for c in counts) for name in ("analyses", "factorizations")
     )
     assert factorizations > 100
-    # 6 where patterns are those of the point and the start; 63 of the point alone.
+    # 6 if patterns combine trial point and start; 63 for patterns of the trial point alone.
     assert analyses < 12

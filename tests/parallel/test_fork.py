@@ -1,4 +1,4 @@
-"""Forked processes step batches on threads of their own after the parent has done so."""
+"""Forked processes step batches on new threads after the parent has used threads."""
 
 import multiprocessing
 import os
@@ -17,7 +17,7 @@ from diffcloth_torch.robots import GRIPPER
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="forks"),
-    # Python 3.12 warns of every fork of a process with threads; that it works is tested here.
+    # Python 3.12 warns of every fork of a process with threads; these tests show that forks work.
     pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning"),
 ]
 
@@ -26,7 +26,7 @@ SIZES = (6, 12, 16)
 
 @pytest.fixture(params=SIZES)
 def after_a_parallel_region(request):
-    """Size, state, the values of its step on two threads that have run here, and a time to wait."""
+    """Size, state, values of a step on two threads of this process, and a time to wait."""
     n = request.param
     state = batch(n, 4)
     with threads(2):
@@ -64,7 +64,7 @@ def test_a_forked_child_steps_batches(after_a_parallel_region, count):
         return all(differing(step(sim, state)[1], expected) == [] for _ in range(2))
 
     assert in_child(repeat, patience) == 0
-    # The parent goes on as before.
+    # The parent continues as before.
     assert differing(step(simulator(n), state)[1], expected) == []
 
 
@@ -79,7 +79,7 @@ def test_a_forked_child_shares_the_work_on_one_environment():
 
 
 def robots(environments):
-    """A state, and a function that steps it; all that a gripper and a box in the air end with."""
+    """A state of a gripper and a box in the air, and a function that returns a step's values."""
     hand = dc.Robot.load(GRIPPER, base="floating", actuation="pd", stiffness=50.0, damping=1.0)
     box = dc.RigidBody.box(0.1, motion="dynamic", mass=0.5, pose=[2, 0, 0, 1, 0.1, 0.2, 0.3])
     contact = dc.ContactOptions(barrier_distance=1e-3)
@@ -138,7 +138,7 @@ def test_a_process_of_multiprocessing_steps_batches(after_a_parallel_region):
 
 
 def wait(process, queue, patience):
-    """Whether an answer comes before the process ends, or takes too long."""
+    """Return whether an answer arrives before the process ends or the patience is exhausted."""
     deadline = time.monotonic() + patience
     while queue.empty():
         process.join(0.05)

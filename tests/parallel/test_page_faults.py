@@ -1,4 +1,4 @@
-"""What threads of one step give back is there for those of the next."""
+"""Memory freed by the threads of one step is reused by the threads of the next."""
 
 import sys
 
@@ -23,7 +23,7 @@ def test_threads_ask_the_system_for_no_more_pages():
         for _ in range(5):
             state = sim.step(state)
         faults = getrusage(RUSAGE_SELF).ru_minflt - faults
-    # A factor and its matrix alone take up 700 pages, in each of 8 environments and 5 steps.
+    # A factor and its matrix alone need 700 pages, in each of 8 environments and 5 steps.
     assert faults < 8 * 5 * 100
 
 
@@ -39,6 +39,6 @@ def test_factors_of_a_step_share_their_pages():
         faults = getrusage(RUSAGE_SELF).ru_minflt
         state = sim.step(state)
         faults = getrusage(RUSAGE_SELF).ru_minflt - faults
-    of_one = 50e6 / 4096  # a factor of this mesh takes up more
+    of_one = 50e6 / 4096  # a factor of this mesh is larger
     assert state.report.counts["factorizations"] >= 3
     assert faults < 2.4 * of_one

@@ -1,4 +1,4 @@
-"""Threads that cannot be made, that fail, and that are interrupted."""
+"""Threads that cannot be started, fail or are interrupted."""
 
 import os
 import resource
@@ -82,7 +82,7 @@ WITHOUT_THREADS = """
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits as Linux has them")
 def test_a_batch_runs_on_the_threads_that_there_are():
-    # Stacks larger than the address space that is left: no thread can be made, all else works.
+    # Stacks exceed the remaining address space: no thread can start, all else works.
     def limit():
         resource.setrlimit(resource.RLIMIT_STACK, (1 << 38, resource.RLIM_INFINITY))
         resource.setrlimit(resource.RLIMIT_AS, (1 << 37, resource.RLIM_INFINITY))
@@ -130,7 +130,7 @@ def interrupting():
 
 @pytest.mark.parametrize("threads", [2, 3])
 def test_an_interrupt_reaches_others_while_the_caller_waits_for_them(interrupting, threads):
-    # The caller's bodies end as soon as others have begun; those would go on for longer.
+    # The caller's tasks end as soon as other threads have begun theirs, which would take longer.
     interrupting(0.5)
     start = time.monotonic()
     with pytest.raises(PressedError):

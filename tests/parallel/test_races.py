@@ -1,6 +1,6 @@
-"""Threads that meet in one simulator, small enough for sanitizers: those see what luck would hide.
+"""Threads share one simulator, in scenes small enough for sanitizers, which detect rare races.
 
-Nothing is repeated and no other process runs; test_threads.py compares the bits of larger meshes.
+Without repetition and without load; test_threads.py compares the bits of larger meshes.
 """
 
 from concurrent.futures import ThreadPoolExecutor

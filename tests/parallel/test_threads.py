@@ -1,6 +1,6 @@
-"""The same bits for any number of threads, forward and backward, on a machine that is busy.
+"""Equal bits for any number of threads, forward and backward, on a busy machine.
 
-Libraries that keep state of their own between threads corrupt small solves rarely: meshes are large
+Libraries with shared state between threads rarely corrupt small solves: therefore meshes are large
 enough to reach their blocked kernels, and steps are repeated under load.
 """
 
@@ -22,7 +22,7 @@ ENVIRONMENTS = 4
 
 @pytest.fixture(scope="module", autouse=True)
 def busy():
-    """Another process that keeps a core busy, so that threads are interrupted anywhere."""
+    """Another process keeps a core busy, so that threads are interrupted at random points."""
     spin = "import sys; print('spins', flush=True)\nwhile True: pass"
     with subprocess.Popen([sys.executable, "-c", spin], stdout=subprocess.PIPE) as process:
         try:
@@ -34,7 +34,7 @@ def busy():
 
 @pytest.fixture(scope="module")
 def serial():
-    """(size, scheme) -> state and values of its step on one thread; made once."""
+    """Map from (size, scheme) to a state and the values of its step on one thread; cached."""
     made = {}
 
     def of(n, scheme="coupled"):
@@ -101,7 +101,7 @@ def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
 @pytest.mark.quick("coupled")
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_threads_that_share_one_environment_change_no_bit(scheme):
-    # As large as it takes: see tests/linalg/test_shared_work.py.
+    # Large enough for shared work: see tests/linalg/test_shared_work.py.
     sim, state = simulator(LARGE, scheme, False), batch(LARGE, 1, scheme=scheme, folded=False)
     with threads(1):
         after, expected = step(sim, state)
@@ -138,5 +138,5 @@ def test_a_thousand_batched_steps_have_the_bits_of_one_thread(n, steps):
             with threads(count):
                 results.append(step(sim, state))
         assert differing(results[1][1], results[0][1]) == []
-        # A short trajectory again and again: what has come to rest tests less.
+        # Repeat a short trajectory: a scene at rest tests less.
         state = results[0][0] if k % 10 < 9 else starts

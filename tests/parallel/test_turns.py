@@ -1,4 +1,4 @@
-"""Threads take the most expensive environments first, and no result depends on it."""
+"""Threads start with the most expensive environments, and no result depends on the order."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ CHEAP = 5  # environments
 
 @pytest.fixture
 def uneven():
-    """A simulator and a batch whose last environment meets a body; the others hang."""
+    """A simulator and a batch: the last environment's sheet meets a body, the others hang."""
     n = 10
     sheet = dc.Cloth.grid(n, n, pins={"corners": [0, n - 1]})
     ball = dc.RigidBody.sphere(0.2, pose=[0.01, 0.02, -0.25, 1, 0, 0, 0])
@@ -41,7 +41,7 @@ def same(a, b):
     return all(torch.equal(p, q) for p, q in zip(a, b, strict=True))
 
 
-def test_what_took_longest_begins_the_next_step(uneven):
+def test_the_slowest_environment_begins_the_next_step(uneven):
     simulator, state = uneven
     with threads(1), torch.no_grad():
         after = simulator.step(state)
@@ -52,7 +52,7 @@ def test_what_took_longest_begins_the_next_step(uneven):
         # Ties and noise decide between the cheap ones.
         assert places(simulator) == np.argsort(np.argsort(seconds)[::-1]).tolist()
         assert places(simulator)[-1] == 0
-        simulator.step(state[-1])  # another batch: nothing is known of it
+        simulator.step(state[-1])  # another batch, without recorded times
         simulator.step(state)
         assert places(simulator) == list(range(CHEAP + 1))
 
@@ -62,7 +62,7 @@ def test_derivatives_of_environments_with_contacts_begin(uneven):
     with threads(1):
         values(simulator, state)
         assert places(simulator) == [*range(1, CHEAP + 1), 0]
-        # Nine losses of an environment are eight, and one.
+        # Nine losses of an environment are processed as eight and one.
         before = state.detach()
         x = before.positions.requires_grad_()
         after = simulator.step(before)

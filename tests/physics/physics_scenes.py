@@ -19,7 +19,7 @@ def tensor(values):
 def strip(cells, rows, length, width, *, alternating=False):
     """Flat strip along x from 0 to `length`, centered in y; vertex [i, j] is i * rows + j.
 
-    All diagonals run one way, or in turns.
+    All diagonals have one direction, or alternate.
     """
     x, y = np.linspace(0, length, cells + 1), np.linspace(-width / 2, width / 2, rows)
     vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((cells + 1, rows))], axis=-1)
@@ -37,7 +37,7 @@ def strip(cells, rows, length, width, *, alternating=False):
 
 
 def jittered_sheet(cells, size, seed=0, share=0.2):
-    """Flat square sheet whose inner vertices are moved in the plane, in general position."""
+    """Flat square sheet with inner vertices displaced in the plane, in general position."""
     vertices, faces = strip(cells, cells + 1, size, size)
     inside = (np.abs(vertices[:, 0] - size / 2) < 0.499 * size) & (
         np.abs(vertices[:, 1]) < 0.499 * size
@@ -85,7 +85,7 @@ class Judge:
         """Judge the scene of a simulator.
 
         `free_links` names the links ("robot/link") that forces move; `passing` pairs of links that
-        do not collide. What is prescribed may overlap other things that are.
+        do not collide. Prescribed surfaces may overlap each other.
         """
         ipctk = pytest.importorskip("ipctk")
         self._ipctk, self._sim = ipctk, sim
@@ -106,7 +106,7 @@ class Judge:
         return [(len(item.vertices), item) for item in [*scene.cloths, *scene.bodies, *links]]
 
     def _filter(self, cloth_count, free_links, passing):
-        """What may collide: no rigid surface with itself, nor two that are prescribed."""
+        """Filter of pairs: no rigid surface with itself, nor two prescribed surfaces."""
         scene = self._sim.scene
         counts = [count for count, _ in self._meshes()][len(scene.cloths) :]
         names = self._sim.surfaces[len(scene.cloths) :]
@@ -117,10 +117,10 @@ class Judge:
             if body.motion == "dynamic"
         }
         free = [name in dynamic or name in free_links for name in names]
-        alone = -1 - np.arange(cloth_count + len(rigid))  # a patch of its own for each vertex
+        alone = -1 - np.arange(cloth_count + len(rigid))  # a separate patch for each vertex
 
         def patches(of_surface):
-            """Filter of one patch for each value >= 0 of a surface, its own for what has -1."""
+            """Filter with one patch per value >= 0 of a surface; -1: one patch per vertex."""
             labels = np.concatenate([np.full(cloth_count, -1), np.asarray(of_surface)[rigid]])
             labels = np.where(labels < 0, alone - alone.min(), len(alone) + labels)
             return self._ipctk.make_vertex_patches_filter(labels.astype(np.int32))
@@ -146,7 +146,7 @@ class Judge:
         return np.concatenate(parts)
 
     def placed(self, path):
-        """Vertices of meshes on a path of the solver, which has four points of what is smooth."""
+        """Vertices of all meshes on a solver path, which has four points for each smooth body."""
         scene, first = self._sim.scene, sum(len(cloth.vertices) for cloth in self._sim.scene.cloths)
         rigid = [(body.vertices, body.contact_surface) for body in scene.bodies]
         for robot in scene.robots:
@@ -168,12 +168,12 @@ class Judge:
         return not self._ipctk.has_intersections(self.mesh, self.points(state))
 
     def is_free_path(self, path):
-        """Whether the straight motions between the configurations of a path are collision-free."""
+        """Return whether straight motions between a path's configurations are collision-free."""
         return all(itertools.starmap(self._is_free_motion, itertools.pairwise(path)))
 
     def _is_free_motion(self, a, b, depth=6):
-        # Both collision detections err on the safe side, each where the other need not (Tight
-        # Inclusion at tiny gaps, additive CCD in fast motion), and both less in short motions.
+        # Both collision detections are conservative in different cases (Tight Inclusion at tiny
+        # gaps, additive CCD in fast motion), and both less so in short motions.
         ipctk = self._ipctk
         if any(
             ipctk.is_step_collision_free(self.mesh, a, b, narrow_phase_ccd=ccd)
@@ -204,7 +204,7 @@ def free_links(scene):
 
 
 def joined_links(scene):
-    """Pairs of names of links that a joint or a fixed joint holds together."""
+    """Pairs of names of links connected by a moving or a fixed joint."""
     return [
         (f"{name}/{a}", f"{name}/{b}")
         for name, robot in zip(scene.robot_names, scene.robots, strict=True)
@@ -213,7 +213,7 @@ def joined_links(scene):
 
 
 def judge_attempt(task, actions):
-    """Judge the whole way of an attempt: what is wrong, and in how many steps things touch."""
+    """Judge all states and paths of an attempt: errors, and the number of steps with contact."""
     sim = task.simulator
     judge = Judge(sim, free_links(task.scene), joined_links(task.scene))
     state = task.initial_state()
@@ -243,7 +243,8 @@ def matrix(q):
 def solver_path(sim, state, control=None):
     """Every accepted iterate of a step, all surfaces [iterates, vertices, 3].
 
-    Not part of the public interface: the judge's look at what the guarantee is about.
+    This is not part of the public interface; the judge needs the path because the guarantee covers
+    it.
     """
     inputs, _ = sim._inputs(state, control, None)
     return sim._core.path({name: as_array(value) for name, value in inputs.items()})

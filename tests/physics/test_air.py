@@ -1,4 +1,4 @@
-"""Cloth in air: closed forms, wind as a control, what air takes and what it drives."""
+"""Cloth in air: closed forms, wind as a control, dissipation and driven motion."""
 
 from dataclasses import replace
 
@@ -29,14 +29,14 @@ MATERIAL = dc.Material(density=RHO, normal_drag=C_N, tangential_drag=C_T)
 
 
 def sheet(turn=None, *, material=MATERIAL, cells=5, **options):
-    """A flat sheet of 0.5 m in general position, in the xy-plane or turned out of it."""
+    """A flat sheet of 0.5 m in general position, in the xy-plane or rotated by `turn`."""
     vertices, faces = jittered_sheet(cells, 0.5)
     placed = vertices if turn is None else vertices @ turn.T
     return dc.Cloth(placed, faces, rest_positions=vertices, material=material, **options)
 
 
 def simulator(cloth, dt=0.01, gravity=(0.0, 0.0, -G), solver=SOLVERS[0], tolerance=1e-9, **scene):
-    """Without self-contact: nothing but air is looked at."""
+    """A simulator without self-contact, to isolate the effect of air."""
     scheme, metric, elastic = solver
     return dc.Simulator(
         dc.Scene([cloth], gravity=gravity, **scene),
@@ -91,7 +91,7 @@ def test_a_sheet_that_drifts_with_the_wind_feels_no_air():
         end = sim.step(start.replace(velocities=drift.clone()), sim.control(wind=w))
         moved.append((end.positions, sim, start))
     torch.testing.assert_close(moved[0][0], moved[1][0], rtol=0, atol=1e-12)
-    # While one that changes its shape does feel it.
+    # A sheet that changes its shape has drag.
     _, sim, start = moved[1]
     bent = start.replace(velocities=wind + shape)
     free = moved[0][1].step(bent).positions
@@ -218,7 +218,7 @@ def test_a_flag_streams_and_flutters_in_wind_and_hangs_without():
     free = np.isclose(x, x.max())
     tail = blown[-100:, free]
     assert tail[..., 0].mean() > 0.95 * x.max()  # streams
-    # Which folds form changes it: 0.58 to 0.61 for bending stiffnesses from 1.9e-5 to 3e-5.
+    # The value depends on the folds: 0.58 to 0.61 for bending stiffnesses from 1.9e-5 to 3e-5.
     assert hanging[-100:, free, 0].mean() < 0.65 * x.max()
     aside = tail[..., 1].mean(axis=1)
     assert np.ptp(aside) > 0.1  # flutters,
@@ -227,8 +227,8 @@ def test_a_flag_streams_and_flutters_in_wind_and_hangs_without():
     assert np.ptp(early) < 0.2 * np.ptp(aside)  # from almost nothing
 
 
-def test_pins_bear_what_the_wind_does():
-    """A sheet that does not move passes on all that the air does to it."""
+def test_pins_bear_the_force_of_the_wind():
+    """A sheet at rest transfers the whole force of the air to its pins."""
     cloth = sheet(rotation((1, 0, 0), np.pi / 2), pins={"all": range(36)})
     sim = simulator(cloth)
     still = sim.step(sim.initial_state())

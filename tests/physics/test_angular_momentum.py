@@ -1,4 +1,4 @@
-"""Implicit Euler keeps linear momentum, and what its formulas say of angular momentum."""
+"""Implicit Euler conserves linear momentum, and loses angular momentum by known formulas."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def kept_in_step(angle):
 
 
 def kept_by_points(speed, dt, steps):
-    """The same of all steps; the first one comes from velocities that are exact."""
+    """Share of angular momentum kept by all steps; the first step has exact start velocities."""
     angle = math.atan(speed * dt)
     kept = math.cos(angle)
     for _ in range(steps - 1):
@@ -105,7 +105,7 @@ def test_boxes_that_a_cord_presses_together_lose_that_of_their_centers(speed, dt
     assert (last - first)[:3].norm() < 1e-9
     kept = float(last[5] / first[5])
     expected = kept_in_time(speed, dt, steps * dt, share)
-    # To a fortieth of the loss: higher orders of w h, and the friction that lags.
+    # Within a fortieth of the loss, due to higher orders of w h and lagged friction.
     assert 1 - kept == pytest.approx(1 - expected, rel=0.025)
     assert 1 - kept > 0.015
 
@@ -125,7 +125,7 @@ def test_a_ball_on_a_turntable_gains_what_the_formula_says(turning, dt, radius):
     simulator = dc.Simulator(
         dc.Scene([], [table, ball]), dt, contact=dc.ContactOptions(barrier_distance=gap)
     )
-    # Rolling on a table that turns leads round a circle at 2/7 of its speed.
+    # A ball rolling on a turntable moves on a circle at 2/7 of the table's angular speed.
     share = 2 / 7
     state = simulator.initial_state()
     velocities = state.body_velocities.clone()

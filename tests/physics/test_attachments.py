@@ -1,4 +1,4 @@
-"""What springs between points do: closed forms, momentum, seams and picking."""
+"""Springs between points: closed forms, momentum, seams and picking."""
 
 import math
 
@@ -100,7 +100,7 @@ def sewn_to_box():
         rest_length=[0.0, 0.1],
         name="seam",
     )
-    # Without contact, as friction that lags has a moment.
+    # Without contact, because lagged friction has a moment.
     scene = dc.Scene(
         [sheet()],
         [box],
@@ -126,7 +126,7 @@ def test_a_free_body_and_cloth_keep_their_momentum():
     reference = torch.as_tensor(before)
     for _ in range(20):
         after = sim.step(state)
-        # Of each step: what the sheet gains, beside the reaction on the box and its moment.
+        # Per step: momentum gained by the sheet, plus the reaction on the box and its moment.
         gained = m[:, None] * (after.velocities - state.velocities) / DT
         points = torch.from_numpy(
             transform(np.array(sim.scene.bodies[0].vertices), after.body_poses[0].numpy())
@@ -144,7 +144,7 @@ def test_a_free_body_and_cloth_keep_their_momentum():
     assert float((momentum - reference).norm()) < 1e-12 * float(reference.norm())
 
 
-def test_what_is_released_is_not_there():
+def test_a_released_attachment_has_no_effect():
     sim = sewn_to_box()
     state = sim.initial_state()
     released = sim.step(state, sim.control(attachment_weights={"seam": [0.0, 0.0]}))
@@ -154,7 +154,7 @@ def test_what_is_released_is_not_there():
 
 
 def tube(rest_length, stiffness=50.0, size=8):
-    """Two panels back to back whose long sides are seamed."""
+    """Two panels back to back, sewn together along their long sides."""
     gap = 0.02
     panels = [sheet("front", size, (0, 0, 0)), sheet("back", size, (0, 0, gap))]
     first, last = np.arange(size) * size, np.arange(size) * size + size - 1
@@ -171,7 +171,7 @@ def test_two_panels_sewn_into_a_tube_stay_together_and_apart(rest_length):
     sim, sides = tube(rest_length)
     state = sim.initial_state()
     n = len(state.positions) // 2
-    # Blow it up: what the seam holds stays, the middle moves away.
+    # Inflate the tube: seamed vertices stay, the middle moves away.
     forces = torch.zeros_like(state.positions)
     forces[:n, 2], forces[n:, 2] = -2e-3, 2e-3
     control = dc.Control(forces=forces)
@@ -191,7 +191,7 @@ def test_two_panels_sewn_into_a_tube_stay_together_and_apart(rest_length):
 
 @pytest.mark.parametrize(("rest_length", "rise"), [(0.0, 40), (6e-3, 1)])
 def test_a_stiff_seam_closes(rest_length, rise):
-    """At once where it is longer than the barrier reaches, else over some steps."""
+    """The weight rises at once if the rest length exceeds the barrier's reach, else gradually."""
     sim, sides = tube(rest_length, stiffness=5000.0)
     state = sim.initial_state()
     n = len(state.positions) // 2
@@ -202,7 +202,7 @@ def test_a_stiff_seam_closes(rest_length, rise):
     assert float(apart.max()) < max(5e-3, rest_length + 1e-4)
 
 
-def test_a_kinematic_hand_carries_what_it_holds_and_lets_go():
+def test_a_kinematic_hand_carries_and_releases_a_sheet():
     hand = dc.RigidBody.box(
         0.04, motion="kinematic", pose=[-0.15, -0.15, 0.06, 1, 0, 0, 0], name="hand"
     )

@@ -1,4 +1,4 @@
-"""The barrier's stiffness: that of a pair of surfaces by default follows from these two alone."""
+"""Barrier stiffness: the default of a pair of surfaces depends only on these two surfaces."""
 
 import warnings
 
@@ -66,7 +66,7 @@ SCENES = {
 
 
 def may_touch(a, b):
-    """Whether two surfaces of these scenes do; the base of the hand stands still."""
+    """Return whether two surfaces of these scenes may touch; the base of the hand is fixed."""
     still = ("floor", "hand/palm")
     if a.startswith("cloth") or b.startswith("cloth"):
         return True
@@ -81,7 +81,7 @@ def test_a_body_far_away_changes_no_default(name, mass):
     alone = pairs(simulator(cloths, bodies, robots, **options))
     far = box(mass, 30.0, 0.0, 1.0, side=0.4, name="far")
     joined = pairs(simulator(cloths, [*bodies, far], robots, **options))
-    # Beside a cloth nothing changes at all; else what never touches has another's number.
+    # With a cloth no default changes; otherwise pairs that never touch have another pair's value.
     compared = {pair: value for pair, value in alone.items() if cloths or may_touch(*pair)}
     assert compared
     assert {pair: joined[pair] for pair in compared} == compared
@@ -89,20 +89,20 @@ def test_a_body_far_away_changes_no_default(name, mass):
 
 
 def test_the_default_of_one_cloth_is_one_number_as_before():
-    """To the last digit that rounding leaves; the share of bending is 1e-6 of it."""
+    """The value is equal up to rounding; bending contributes a share of 1e-6."""
     sim = simulator([sheet(8, density=0.2, stretch=700.0, bending=2e-5)], [FLOOR])
     stiffness = sim.default_parameters().barrier_stiffness
     assert stiffness.shape == ()
     assert stiffness.item() == pytest.approx(3718.8886128683357, rel=1e-12)
 
 
-def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
+def test_a_pair_has_the_larger_stiffness_of_its_two_surfaces():
     soft, stiff = sheet(8), sheet(8, 0.1, stretch=9e3)
     light, heavy = box(0.2, 0, 0, 0.3, name="light"), box(80.0, 0, 0, 0.5, name="heavy")
     found = pairs(simulator([soft, stiff], [FLOOR, light, heavy]))
     for own, other in (("cloth0", "floor"), ("cloth0", "light"), ("heavy", "floor")):
         assert found[own, other] == found[other, own]
-    # Each with the floor is what it needs itself.
+    # The pair with the floor has the surface's own requirement.
     needs = {name: found[name, "floor"] for name in ("cloth0", "cloth1", "light", "heavy")}
     assert needs["light"] < needs["cloth0"] < needs["cloth1"] < needs["heavy"]
     assert needs["heavy"] == pytest.approx(400 * needs["light"], rel=1e-12)
@@ -113,7 +113,7 @@ def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
                 assert found[a, b] == max(needs[a], needs[b])
 
 
-def test_what_a_cloth_needs_is_that_of_the_cloth_alone():
+def test_a_cloth_needs_the_stiffness_of_a_scene_of_its_own():
     options = {"barrier_distance": 3e-3}
     cloths = [sheet(8, thickness=1e-3), sheet(6, 0.1, stretch=90.0, density=0.4)]
     found = pairs(simulator(cloths, [FLOOR], **options))
@@ -122,7 +122,7 @@ def test_what_a_cloth_needs_is_that_of_the_cloth_alone():
         assert found[f"cloth{k}", "floor"] == alone["cloth0", "cloth0"]
 
 
-def test_joints_count_where_nothing_else_does():
+def test_joints_count_only_against_static_surfaces():
     found = pairs(simulator([sheet()], [FLOOR, box(0.7, 1, 0, 0.2, name="box")], [arm()]))
     finger = "hand/left_finger"
     alone = pairs(simulator([], [FLOOR], [arm()], barrier_distance=0.005))
@@ -142,14 +142,14 @@ def test_a_body_far_away_does_not_change_how_a_cloth_lands():
     alone = rolled(simulator(*near), 25)
     far = box(95.0, 30.0, 0.0, 1.0)
     joined = rolled(simulator(near[0], [*near[1], far]), 25)
-    # One solve moves both, to a tolerance of 1e-6 m/s.
+    # One solve moves both bodies, to a tolerance of 1e-6 m/s.
     for a, b in zip(alone, joined, strict=True):
         assert (a.positions - b.positions).abs().max() < 1e-8
     assert alone[-1].report.contact_count > 50
 
 
 def test_a_heavy_box_lands_beside_a_cloth():
-    """It rests at half the barrier distance, and the cloth where it does without the box."""
+    """The box rests at half the barrier distance; the cloth rests as without the box."""
     cloth = sheet(9, 0.004)
     alone = rolled(simulator([cloth], [FLOOR]), 60)[-1]
     sim = simulator([cloth], [FLOOR, box(100.0, 0.5, 0.0, 0.2, name="box")])
@@ -185,8 +185,8 @@ def at_half_gap(xi, reach):
 
 
 @pytest.mark.parametrize(("mass", "of"), [(1e-3, "cloth0"), (50.0, "ball")])
-def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
-    """Beside thickness of its own: a cloth needs a curvature at half the gap, a body a slope."""
+def test_a_radius_does_not_reduce_the_stiffness_of_a_surface(mass, of):
+    """With additional thickness: a cloth needs a curvature at half the gap, a body a slope."""
     reach, radius, thicknesses = 3e-3, 0.04, {"cloth0": 2e-3, "ball": 7e-3}
     ball = dc.RigidBody.sphere(
         radius,
@@ -203,14 +203,14 @@ def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
     with_radius, without = (at_half_gap(xi + r, reach)[kind] for r in (radius, 0.0))
     if of == "cloth0":
         need = found["cloth0", "cloth0"] * without
-    else:  # its weight, on a sixth of its area of which a vertex counts a quarter
+    else:  # the weight on a sixth of the area, of which a vertex counts a quarter
         area = 4 * np.pi * radius**2
         need = mass * G / (0.25 * area / 6)
     assert abs(found["cloth0", "ball"] * with_radius) == pytest.approx(need, rel=1e-9)
 
 
-def test_without_gravity_a_body_needs_what_stops_it_within_a_step():
-    """As much as with a gravity that falls through the barrier distance, from rest, in a step."""
+def test_a_body_without_gravity_needs_a_stiffness_that_stops_it_within_a_step():
+    """Equal to the need at a gravity that falls through the barrier distance in one step."""
     reach = 4e-3
     found = []
     for g in (0.0, reach / DT**2):
@@ -254,7 +254,7 @@ def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thic
 
 
 def test_a_joint_needs_what_the_mass_at_its_farthest_point_needs(tmp_path):
-    """An arm twice as large and no heavier has the same mass there, on four times the area."""
+    """An arm of twice the size and equal mass has equal mass there, on four times the area."""
     found = []
     for size in (1.0, 2.0):
         path = tmp_path / "arm.urdf"
@@ -288,7 +288,7 @@ def test_boxes_of_different_mass_stand_on_each_other(masses):
 
 @pytest.mark.parametrize("mass", [0.5, 10.0, 100.0])
 def test_a_cloth_lies_between_a_floor_and_a_box(mass):
-    """The floor and the cloth do not know what lies on it: the gap shrinks, and holds."""
+    """The stiffness of floor and cloth ignores the box's load: the gap shrinks but stays open."""
     sim = simulator([sheet(9, 0.01)], [FLOOR, box(mass, 0, 0, 0.08, name="box")])
     state = rolled(sim, 80)[-1]
     assert state.positions[:, 2].min() > 0.01 * sim.default_parameters().barrier_distance
@@ -324,7 +324,7 @@ def test_a_start_is_deep_by_the_stiffness_of_its_own_pair():
 
 
 def several(scheme="coupled", coupling="monolithic", **options):
-    """Two sheets on a floor, and a box on them where the scheme takes one."""
+    """Two sheets on a floor, and a box on the sheets unless the scheme is `split`."""
     bodies = [FLOOR] if scheme == "split" else [FLOOR, box(0.4, 0.03, 0.02, 0.086, name="box")]
     cloths = [sheet(6, 0.01, friction=0.3), sheet(5, 0.022, stretch=300.0)]
     dt = 0.002 if coupling == "cloth_to_rigid" else DT
@@ -349,7 +349,7 @@ def gradient_and_end(sim, state, parameters):
 
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 @pytest.mark.parametrize(("scheme", "coupling"), WAYS)
-def test_one_number_is_the_same_for_every_pair(scheme, coupling):
+def test_a_single_number_applies_to_every_pair(scheme, coupling):
     """Bit for bit, and its gradient is the sum of theirs."""
     sim = several(scheme, coupling, barrier_stiffness=1500.0)
     count = len(sim.surfaces)
@@ -439,6 +439,6 @@ def test_defaults_do_not_know_the_unit_of_length(unit):
             dc.Scene([grid], bodies, gravity=gravity), DT, solver=solver, contact=contact
         )
 
-    # Of N/m^2, of which N has one length: 1/length.
+    # The unit is N/m^2, and N contains one length: the stiffness scales with 1/length.
     expected, found = scene(1.0).default_parameters(), scene(unit).default_parameters()
     assert torch.equal(found.barrier_stiffness * unit, expected.barrier_stiffness)

@@ -22,7 +22,7 @@ SCHEMES = ["coupled", "split"]
 
 
 def sheet(cells, size, height, *, seed=0, turn=0.3, center=(0.0, 0.0), **keywords):
-    """Jittered square sheet, turned in its plane, so that nothing lines up with a body's edges."""
+    """Jittered square sheet, rotated in its plane to avoid alignment with a body's edges."""
     vertices, faces = jittered_sheet(cells, size, seed)
     vertices = vertices - [size / 2, 0, 0]
     pose = np.array([*center, height, *quaternion([0, 0, 1], turn)])
@@ -64,7 +64,7 @@ def test_a_cloth_drapes_over_a_ball_without_intersections(scheme, thickness):
             assert state.report.minimum_distance > (0.5 * thickness if thickness else 0.0)
         contacts = max(contacts, state.report.contact_count)
     assert contacts > 15
-    assert state.positions[:, 2].min() < 0.1  # it hangs around the ball
+    assert state.positions[:, 2].min() < 0.1  # the cloth hangs around the ball
 
 
 def accordion(cells, folds, size, **keywords):
@@ -114,7 +114,7 @@ def test_the_floor_carries_the_weight(scheme):
 
 
 def energy_gained(metric):
-    """What a passive drape gains over its energy at the start, by the largest of its states."""
+    """Largest energy of a passive drape above its energy at the start."""
     cloth = sheet(12, 1.0, 0.31)
     ball = dc.RigidBody.sphere(0.3, subdivisions=3)
     solver = dc.SolverOptions(metric=metric)
@@ -182,7 +182,7 @@ def test_momentum_is_conserved_between_unequal_cloths(scheme, metric):
 
 
 def test_the_identity_metric_does_not_conserve_momentum():
-    # Known, and the reason for the other metrics: the test above can tell.
+    # Known, and the reason for the other metrics; the test above can therefore fail.
     p = momenta(*colliding_layers("split", "identity"), 6)
     assert p.diff(dim=0).abs().max() > 1e-6
 
@@ -206,7 +206,7 @@ def test_momentum_is_conserved_in_self_contact():
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_action_is_reaction(scheme, friction):
-    # On a ball: what the cloth's momentum changes beyond gravity, the body gets.
+    # The ball receives minus the cloth's momentum change beyond gravity.
     material = dc.Material(stretch=100.0, friction=friction)
     cloth = sheet(6, 0.4, 0.105, material=material, center=(0.03, 0.02))
     ball = dc.RigidBody.sphere(0.1, subdivisions=2, friction=friction)
@@ -223,7 +223,7 @@ def test_action_is_reaction(scheme, friction):
         on_cloth = masses * ((after.velocities - state.velocities) / sim.dt - gravity)
         assert (on_cloth.sum(dim=0) + after.body_forces.sum(dim=0)).abs().max() < 1e-9
         if friction == 0.0 and scheme == "coupled":
-            # Lagged friction leaves a couple; `split` takes gravity's torque where x^D was.
+            # Lagged friction has a couple; `split` applies gravity's torque at x^D.
             torque = torch.linalg.cross(after.positions, on_cloth).sum(dim=0)
             torque += torch.linalg.cross(points, after.body_forces).sum(dim=0)
             assert torque.abs().max() < 1e-9
@@ -248,7 +248,7 @@ def test_a_passive_scene_loses_energy():
         return 0.5 * (masses * v**2).sum().item()
 
     state = sim.initial_state()
-    # Relative to the lowest height that matters, so that the scale is that of the fall.
+    # Relative to the lowest relevant height, so the scale is the energy of the fall.
     scale = masses.sum().item() * G * 0.26
     contacts = 0
     for _ in range(30):

@@ -137,7 +137,7 @@ def test_a_belt_slips_beyond_eulers_ratio():
 
 
 def test_a_moving_body_drags_the_cloth_along():
-    # A conveyor belt: the sheet on it gains speed at mu g, then rides with it.
+    # A conveyor belt: the sheet accelerates by mu g, then moves with the belt.
     vertices, faces = strip(2, 3, 0.1, 0.1)
     vertices = vertices @ matrix(quaternion([0, 0, 1], 0.3)).T + [0.03, 0.02, 2e-3]
     cloth = dc.Cloth(vertices, faces, material=dc.Material(friction=0.5, bending=1e-3))

@@ -1,7 +1,7 @@
 """Elasticity and time integration against closed forms, through the public interface.
 
-The numbers are those of the theory: inextensible elastica under its own weight or an end load,
-the catenary, free fall, and the recursions of implicit Euler.
+The expected numbers come from theory: the inextensible elastica under its own weight or an end
+load, the catenary, free fall, and the recursions of implicit Euler.
 """
 
 import numpy as np
@@ -60,7 +60,7 @@ def test_an_affine_stretch_is_held_by_its_edge_tractions(stretches):
     state = sim.initial_state().replace(positions=tensor(stretched))
     after = sim.step(state, dc.Control(forces=loads))
     assert (after.positions - state.positions).abs().max() < 1e-10
-    # The loads matter: without them it springs back at once.
+    # Without the loads the sheet springs back at once.
     assert (sim.step(state).positions - state.positions).abs().max() > 1e-3
 
 
@@ -76,7 +76,7 @@ def test_rigid_motion_and_folding_cost_no_membrane_energy():
     beyond = vertices[:, 0] > 0.5
     hinge = rotation([0, 1, 0], -2.0)
     fold[beyond] = (vertices[beyond] - [0.5, 0, 0]) @ hinge.T + [0.5, 0, 0]
-    # Split along the fold: diagonals do not cross x = 0.5 because it is a row of vertices.
+    # The fold runs along a row of vertices: no diagonal crosses x = 0.5.
     assert abs(sim.energy(state.replace(positions=tensor(fold)))) < 1e-12 * k_s * area
 
 
@@ -84,10 +84,11 @@ def test_rigid_motion_and_folding_cost_no_membrane_energy():
 @pytest.mark.parametrize("yarn", ["warp", "weft"])
 @pytest.mark.parametrize("name", ["tablecloth", "denim", "blanket"])
 def test_a_dead_load_along_a_yarn_strains_it_by_its_stiffness(name, yarn, over):
-    """T / k, whatever the shear, and with straight sides.
+    """The strain is T / k for any shear stiffness, and the sides are straight.
 
-    A strain that grows quadratically with shear, S_ww - 1 = |w| cos - 1, lets a strip shear by
-    itself from T = 2 k_wf (1 + T / k) on. Loads are multiples of it, up to a strain of 0.6.
+    With a strain that grows quadratically with shear, S_ww - 1 = |w| cos - 1, a strip would shear
+    spontaneously from T = 2 k_wf (1 + T / k) on. Loads are multiples of this T, up to a strain of
+    0.6.
     """
     material = dc.fabrics.material(name)
     k = material.stretch if yarn == "warp" else material.stretch_weft
@@ -114,9 +115,9 @@ def test_a_dead_load_along_a_yarn_strains_it_by_its_stiffness(name, yarn, over):
 
 
 def test_a_strip_stretches_under_its_own_weight():
-    # Elongation w L^2 / (2 k_s), exactly so for rows of lumped weight. The lumped masses of the
-    # corners are uneven, but by reciprocity the mean of the end's displacement, weighted as an even
-    # load on it would be, does not see that as long as strains are small.
+    # The elongation w L^2 / (2 k_s) is exact for rows of lumped weight. The lumped masses of the
+    # corners are uneven, but by reciprocity the end's mean displacement, weighted as a uniform end
+    # load, does not depend on this for small strains.
     cells, rows, length, width, density, k_s, g = 20, 4, 2.0, 0.3, 0.3, 6e4, 9.81
     vertices, faces = strip(cells, rows, length, width)
     material = dc.Material(stretch=k_s, density=density)
@@ -133,7 +134,7 @@ def test_a_strip_stretches_under_its_own_weight():
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 1.2, np.pi / 2])
 def test_a_sheet_on_a_cylinder_has_the_energy_of_its_curvature(angle):
-    # E = D c^2 A / 2; the membrane is made weak, chords are shorter than arcs.
+    # E = D c^2 A / 2; the membrane is weak because chords are shorter than arcs.
     D, c, size = 2.0, 0.3, 1.0
     vertices, faces = jittered_sheet(8, size)
     material = dc.Material(stretch=1e-4, bending=D, poisson=0.3)
@@ -148,7 +149,7 @@ def test_a_sheet_on_a_cylinder_has_the_energy_of_its_curvature(angle):
 
 
 def clamped_strip(D, *, density, cells, rows=3):
-    """Horizontal strip of nu = 0, clamped by two pinned columns; the rest of it is 1 m long."""
+    """Horizontal strip of nu = 0, clamped by two pinned columns; its free part is 1 m long."""
     cell = 1 / cells
     vertices, faces = strip(cells + 1, rows, 1 + cell, 4 * cell)
     vertices[:, 0] -= cell
@@ -327,7 +328,7 @@ def test_a_swinging_cloth_converges_at_first_order():
 
 @pytest.mark.rounding
 def test_a_flat_sheet_hung_by_two_corners_buckles():
-    # In its plane it would end in a saddle: the smallest eigenvalue of its Hessian is negative.
+    # A planar solution would be a saddle: the Hessian's smallest eigenvalue is negative.
     vertices, faces = strip(11, 12, 1.0, 1.0)
     pins = {"corners": [0, 11]}
     cloth = dc.Cloth(vertices, faces, material=dc.Material(stretch=1e4), pins=pins)

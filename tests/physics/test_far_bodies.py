@@ -1,4 +1,4 @@
-"""A body in free flight that touches nothing changes no bit of what else there is."""
+"""A body in free flight without contact changes no bit of all other motion."""
 
 import importlib
 from pathlib import Path
@@ -31,7 +31,7 @@ def box(*place, side=0.05, mass=0.1):
 
 
 def stiff_sheets(scenes):
-    """Two sheets fold over a ball, and a box falls on them."""
+    """Two sheets fold over a ball, and a box falls onto the sheets."""
     cloths = [
         sheet(12, 11, 0.08, 0.7, density=0.2, stretch=900, bending=2e-5),
         sheet(9, 8, 0.2, 0.1, density=0.1, stretch=300, bending=2e-5),
@@ -41,7 +41,7 @@ def stiff_sheets(scenes):
 
 
 def sheet_on_moving_box(scenes):
-    """A sheet pinned at one side lies on a box that is carried away under it."""
+    """A sheet pinned at one side lies on a box that moves away below the sheet."""
     cloth = sheet(13, 13, 0.001, 0.0, stretch=2000, bending=1e-5)
     pinned = dc.Cloth(cloth.vertices, cloth.faces, pins={"side": range(13)})
     body = dc.RigidBody.box(0.2, motion="kinematic", pose=[0, 0, -0.11, 1, 0, 0, 0])
@@ -62,7 +62,7 @@ FAR = {
 
 @pytest.fixture
 def scenes(monkeypatch):
-    """What is timed."""
+    """The scenes of the benchmarks."""
     monkeypatch.syspath_prepend(ROOT)
     return importlib.import_module("benchmarks.scenes")
 
@@ -76,7 +76,7 @@ def make(scenes, name):
 
 
 def run(given, far, steps, speeds=SPEEDS):
-    """States of the scene with bodies far away that start with these speeds."""
+    """States of the scene with the bodies `far` added, at these start velocities."""
     near = len(given.scene.bodies)
     scene = given.scene
     contact = dc.ContactOptions(barrier_distance=2e-3) if not scene.cloths else dc.ContactOptions()
@@ -124,7 +124,7 @@ def test_no_bit_changes(scenes, name, far):
     assert touched > steps // 2 or name not in OWN
 
 
-def test_every_scene_that_is_timed_is_looked_at(scenes):
+def test_every_timed_scene_is_tested(scenes):
     assert set(TIMED) == set(timed(scenes))
 
 
@@ -137,7 +137,7 @@ def test_far_bodies_fly_as_alone(scenes):
 
 @pytest.mark.parametrize("name", ["stiff-sheets", "impact", "hanging"])
 def test_a_body_that_rests_far_away_changes_little(scenes, name):
-    """One solve moves both, to a tolerance: ends were 4 and 8 cm elsewhere."""
+    """One solve moves both, to a tolerance; end states once differed by 4 and 8 cm."""
     given = make(scenes, name)
     floor = dc.RigidBody.plane(2.0, pose=[30, 0, -3, 1, 0, 0, 0])
     place = [30.0, 0.0, -3 + 0.25 + 0.004]

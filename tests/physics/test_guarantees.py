@@ -1,4 +1,4 @@
-"""No intersection ever, however fast things move: in frames, on the path, judged by ipctk."""
+"""No intersection at any speed, in states and on paths, judged by ipctk."""
 
 import numpy as np
 import pytest
@@ -41,9 +41,9 @@ def bodies():
 
 
 def attempt(sim, judge, state, control):
-    """Step, and judge the whole way; None where it is refused, as infeasible or too hard.
+    """Step and judge the whole path; None if the step is refused as infeasible or too hard.
 
-    A refusal harms nothing: the given state keeps its bits, and holding still works afterwards.
+    After a refusal the given state has its bits, and a step without motion still works.
     """
     before = state.positions.clone(), state.velocities.clone(), state.body_poses.clone()
     path = solver_path(sim, state, control)
@@ -93,7 +93,7 @@ def test_a_fast_body_never_passes_through(speed, body, pins, scheme):
 @pytest.mark.parametrize("degrees", [60.0, 179.0])
 @pytest.mark.parametrize("pins", ["top", "all"])
 def test_a_fast_turning_body_never_passes_through(degrees, pins):
-    # A wing hinged beside the curtain that starts to point away from it and turns through it.
+    # A wing hinged beside the curtain starts pointing away and rotates through the curtain.
     wing = dc.RigidBody.box([0.3, 0.2, 0.01])
     hinged = wing.vertices + np.array([0.15, 0, 0])
     start = quaternion([0, 1, 0], np.pi - 0.6)
@@ -112,7 +112,7 @@ def test_a_fast_turning_body_never_passes_through(degrees, pins):
         moved += 1
         state = after
     if pins == "top" and degrees == 60.0:
-        assert moved > 0  # a hanging cloth can give way
+        assert moved > 0  # a hanging cloth can yield
 
 
 def test_a_body_driven_far_into_a_pinned_cloth_stretches_it_or_is_refused():
@@ -131,7 +131,7 @@ def test_a_body_driven_far_into_a_pinned_cloth_stretches_it_or_is_refused():
 
 
 def squeeze(gap, push, **keywords):
-    """A free cloth between two plates, `gap` from it, that are pushed together."""
+    """A free cloth between two plates at distance `gap`, which are pushed together."""
     vertices, faces = jittered_sheet(4, 0.3)
     cloth = dc.Cloth(vertices - [0.15, 0, 0], faces, material=dc.Material(**keywords))
     slabs = [

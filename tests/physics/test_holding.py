@@ -1,4 +1,4 @@
-"""What a grip holds stays there, with the default slip velocity."""
+"""Objects in a grip stay in place, with the default slip velocity."""
 
 import importlib
 import math
@@ -15,7 +15,7 @@ MINUTE = 60.0
 
 @pytest.mark.quick("box")
 @pytest.mark.parametrize("what", ["box", "cloth"])
-def test_it_moves_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeypatch):
+def test_a_held_object_creeps_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeypatch):
     monkeypatch.syspath_prepend(ROOT)
     sticking = importlib.import_module("benchmarks.sticking")
     _, sunk, law = sticking.held(what, dc.ContactOptions().slip_velocity, MINUTE)
@@ -24,7 +24,7 @@ def test_it_moves_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeyp
 
 
 def test_a_box_creeps_by_the_law_at_the_default_tolerance():
-    """The tolerance is a third of the creep: a solve goes on for forces that change with slip."""
+    """The tolerance is a third of the creep: a solve also iterates until slip forces converge."""
     slope, mu, gap = 0.25, 0.5, 5e-4
     turn = [math.cos(slope / 2), 0.0, math.sin(slope / 2), 0.0]
     up = 0.02 + gap

@@ -1,4 +1,4 @@
-"""The same scene, seen or computed in another way, behaves the same."""
+"""A scene in another frame, unit or representation has the same motion."""
 
 import dataclasses
 import io
@@ -34,7 +34,7 @@ class Setting:
     lift: np.ndarray  # velocity of the ball
     spin: np.ndarray  # quaternion of its turn in each step
     gravity: np.ndarray
-    # Units: meters, kilograms and seconds in those of the setting.
+    # Units: one meter, kilogram and second in units of the setting.
     m: float = 1.0
     kg: float = 1.0
     s: float = 1.0
@@ -106,7 +106,7 @@ class Setting:
         state = sim.initial_state(batch_size)
         for _ in range(STEPS):
             state = sim.step(state, self.control(sim, state))
-        # A smooth ball touches the face that it is below, and no more.
+        # A smooth ball touches only the face above it.
         assert np.all(np.asarray(state.report.contact_count) >= (1 if self.smooth else 5))
         return state
 
@@ -221,7 +221,7 @@ def test_a_saved_state_in_contact_continues_with_the_same_bits(reference):
 
 
 def test_the_reference_depends_on_what_the_tests_change(reference):
-    # Each comparison above could fail: the scene reacts to gravity, the ball's way and its turn.
+    # Each comparison above can fail: the scene reacts to gravity and the ball's motion.
     base, expected = reference
     for changes in (
         {"gravity": base.gravity * 1.001},

@@ -13,7 +13,7 @@ ALONG_Y = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
 
 
 def obstacle(kind, place):
-    """A body whose top, or whose axis if it lies along y, is at a place."""
+    """A body with its top (a capsule along y: its axis) at `place`."""
     x, y, z = place
     if kind == "capsule":
         return dc.RigidBody.capsule(0.05, 1.0, pose=[x, y, z, *ALONG_Y])
@@ -23,7 +23,7 @@ def obstacle(kind, place):
 
 
 def passive_scene(seed):
-    """Scene, time step [s] and velocity [m/s] of a sheet; nothing drives it."""
+    """Scene, time step [s] and velocity [m/s] of a sheet without driving forces."""
     r = np.random.default_rng(seed)
     motion, kind = ("swing", "fall", "fold")[seed % 3], ("capsule", "box", "floor")[seed // 3 % 3]
     n, size = int(r.integers(6, 10)), r.uniform(0.35, 0.6)
@@ -57,7 +57,7 @@ def passive_scene(seed):
 
 
 def energy_gained(scene, dt, speed=(0.0, 0.0, 0.0), *, metric=None, duration=0.5):
-    """All that the energy of `split` is ever above an earlier one, over m g .2 m."""
+    """Largest rise of the energy of `split` above an earlier value, over m g .2 m."""
     solver = dc.SolverOptions(metric=metric)
     sim = dc.Simulator(scene, dt, scheme="split", solver=solver)
     (cloth,) = scene.cloths
@@ -102,7 +102,7 @@ def test_a_sheet_that_swings_onto_a_capsule_gains_no_energy_in_split(stretch, dt
 
 
 def test_a_metric_that_resists_turns_gains_energy_where_the_energy_itself_does_not():
-    """A stiff sheet turns far in a step, as the guide says: `elastic` is not the default."""
+    """A stiff sheet turns far in a step; therefore `elastic` is not the default (see the guide)."""
     scene, dt = swing(5000.0), 0.03
     assert energy_gained(scene, dt, metric="elastic") > 0.3
     assert energy_gained(scene, dt, metric="energy") < 0.02

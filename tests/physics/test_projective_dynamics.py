@@ -47,7 +47,7 @@ def simulator(cloths, elastic, bodies=(), **solver):
 
 
 def shaken(sim):
-    """A state whose velocities stretch and bend, and a control that moves what is held."""
+    """A state with velocities that stretch and bend, and a control that moves the pins."""
     g = torch.Generator().manual_seed(0)
     state = sim.initial_state()
     noise = torch.randn(state.velocities.shape, generator=g, dtype=F64)
@@ -65,7 +65,7 @@ def shaken(sim):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_it_finds_the_positions_of_newton(name):
+def test_projective_dynamics_finds_the_positions_of_newton(name):
     """Over three steps, each from the same state for both."""
     newton, projective = (
         simulator(SCENES[name](), elastic) for elastic in ("newton", "projective")
@@ -79,7 +79,7 @@ def test_it_finds_the_positions_of_newton(name):
         assert (found.positions - state.positions).abs().max() < 1e-10
 
 
-def test_it_has_the_contact_and_the_gradient_of_newton():
+def test_projective_dynamics_has_the_contact_and_the_gradient_of_newton():
     """A sheet that slides on a box: both stages, and their adjoint."""
     results = []
     for elastic in ("newton", "projective"):
@@ -105,7 +105,7 @@ def test_it_has_the_contact_and_the_gradient_of_newton():
 
 
 def test_parameters_and_history_leave_no_trace():
-    """The same bits alone and in a batch, and after other parameters have made other matrices."""
+    """Equal bits alone, in a batch, and after steps with other parameters and matrices."""
     sim = simulator(SCENES["patch"](), "projective")
     state, control = shaken(sim)
     once = sim.step(state, control).positions
@@ -117,7 +117,7 @@ def test_parameters_and_history_leave_no_trace():
         assert torch.equal(positions, once)
 
 
-def test_its_iterations_are_bounded():
+def test_iterations_of_projective_dynamics_are_bounded():
     sim = simulator(SCENES["stiff"](), "projective", max_iterations=1, metric="elastic")
     state, control = shaken(sim)
     with pytest.raises(dc.NotConverged, match=r"iterations of the step .* are used up") as e:
@@ -129,7 +129,7 @@ def test_its_iterations_are_bounded():
 
 @pytest.mark.parametrize("metric", ["elastic", None])
 def test_newtons_method_takes_what_its_iterations_do_not_solve(metric):
-    """Also without contact at nodes: their number was the end of a stiff sheet."""
+    """Newton also takes over without nodal contact; the iteration limit once ended such steps."""
     solver = {"max_iterations": 30}
     sim = simulator(SCENES["stiff"](), "projective", **solver)
     state, control = shaken(sim)
@@ -149,8 +149,8 @@ def test_forces_beyond_what_float64_resolves_are_reported(force):
     assert e.value.report.residual > TOLERANCE
 
 
-def test_a_saddle_stops_it_and_has_no_gradient():
-    """It does not look at curvature: what is flat in its plane stays flat, and backward says so."""
+def test_a_saddle_stops_projective_dynamics_and_has_no_gradient():
+    """The iterations ignore curvature: a planar sheet stays planar, and backward reports it."""
     stiff = dc.Material(stretch=1e4)
     upright = dc.Cloth.grid(
         10,
@@ -161,7 +161,7 @@ def test_a_saddle_stops_it_and_has_no_gradient():
         pins={"a": [0, 9]},
     )
     scene = dc.Scene([upright])
-    # The contact stage of the other metrics, which has nothing to do here, leaves it there.
+    # The contact stage of the other metrics, here without contact, keeps the saddle.
     solver = dc.SolverOptions(elastic="projective", metric="elastic")
     sim = dc.Simulator(scene, 0.05, scheme="split", solver=solver)
     state = sim.initial_state()

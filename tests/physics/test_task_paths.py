@@ -1,4 +1,4 @@
-"""What the tasks do never intersects, robots included: every path of a whole attempt is judged."""
+"""Tasks, robots included, never intersect: every path of a whole attempt is judged."""
 
 from pathlib import Path
 

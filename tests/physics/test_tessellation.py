@@ -1,4 +1,4 @@
-"""What a sheet does on a body does not depend on how the body is cut into triangles."""
+"""The motion of a sheet on a body does not depend on the body's triangulation."""
 
 import numpy as np
 import pytest
@@ -170,7 +170,7 @@ def test_stopping_on_any_floor_is_stopping_on_one_triangle():
 
 
 def test_a_moving_floor_drags_alike():
-    """A conveyor of many triangles gives a sheet the speed that one of two does."""
+    """Conveyors of many triangles and of two triangles accelerate a sheet equally."""
     speeds = []
     for columns in (1, 30):
         vertices, faces = strip(2, 3, 0.1, 0.1)

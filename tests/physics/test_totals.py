@@ -22,7 +22,7 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 
 @pytest.fixture(scope="module")
 def sim():
-    """Two cloths of two materials a free box, and a gripper that floats."""
+    """Two cloths of two materials, a free box, and a floating gripper."""
     first = dc.Cloth.grid(
         4,
         4,
@@ -96,7 +96,7 @@ def test_the_parts_of_the_energy_add_up_to_it(sim):
         assert torch.equal(part[0], parts[name])
 
 
-def test_each_part_is_what_its_name_says():
+def test_parts_of_the_energy_are_those_of_their_names():
     """A square that is stretched, lies within reach of the floor, and pulls at its soft pins."""
     cloth = dc.Cloth.grid(
         3, 3, size=0.2, material=dc.Material(bending=0.0), soft_pins={"all": range(9)}
@@ -207,7 +207,7 @@ def test_vertex_masses_follow_the_parameters(sim):
 
 
 def test_vertex_masses_are_those_of_a_step():
-    """A push changes the velocity of a vertex by h f / m, where nothing else holds it."""
+    """A push changes the velocity of an otherwise free vertex by h f / m."""
     cloth = dc.Cloth.grid(3, 3, material=dc.Material(stretch=1e-9, bending=0.0))
     sim = dc.Simulator(
         dc.Scene([cloth], gravity=WEIGHTLESS),
@@ -236,7 +236,7 @@ def test_momentum_by_hand():
         velocities=tensor([0, 5, 0]).expand(9, 3),
         body_velocities=tensor([[0, 0, 6, 0, 0, 7]]),
     )
-    # The pose takes x to y, y to z and z to x: about the world's z the box turns about its own y.
+    # The pose maps x to y, y to z and z to x: rotation about the world's z is about the box's y.
     moment = 3.0 / 12 * (0.1**2 + 0.3**2)
     expected = [0, 0.124 * 5, 3 * 6, 4 * 3 * 6, 0, 2 * 0.124 * 5 + moment * 7]
     np.testing.assert_allclose(sim.momentum(state), expected, rtol=1e-12, atol=1e-12)
@@ -269,7 +269,7 @@ def test_a_pendulum_by_hand(tmp_path):
 
 
 def test_a_base_that_is_fixed_has_no_velocity(tmp_path):
-    """Whatever the state says: neither its energy nor a step takes notice."""
+    """Neither the energy nor a step depends on the state's velocity of a fixed base."""
     path = tmp_path / "pendulum.urdf"
     path.write_text(PENDULUM)
     hinge = dc.Robot.load(path, actuation="torque", base="fixed", name="pendulum")
@@ -285,7 +285,7 @@ def test_a_base_that_is_fixed_has_no_velocity(tmp_path):
 
 
 def test_drives_of_prescribed_joints_have_no_inertia(sim):
-    """They are part of what prescribes them: the first finger's position is, the second's not."""
+    """The first finger's position is prescribed, so its drive has no energy; the second's has."""
     state = moved(sim)
     geared = sim.default_parameters().replace(joint_armature=tensor([0.1, 0.2]))
     drives = sim.kinetic_energy(state, geared) - sim.kinetic_energy(state)
@@ -338,7 +338,7 @@ def test_momentum_is_the_rate_of_the_moments_of_mass(sim):
 
 
 def advanced(sim, state, time):
-    """Where the velocities of a state lead in a short time."""
+    """The state after a short time at its velocities."""
 
     def turned(poses, centers, velocities):
         """Bodies at `poses` [n, 7] about their centers of mass, in their frames [n, 3]."""
@@ -371,7 +371,7 @@ def advanced(sim, state, time):
 
 
 def test_angular_momentum_is_about_the_origin(sim):
-    """What a shift of everything adds is shift x P."""
+    """A shift of all positions adds shift x P."""
     state = moved(sim)
     shift = tensor([1.0, -2.0, 0.5])
     place = torch.nn.functional.pad(shift, (0, 4))
@@ -423,7 +423,7 @@ def test_a_free_scene_keeps_its_momentum():
     ],
 )
 def test_gradients_are_those_of_differences(sim, name):
-    """Of a weighted sum of momentum and kinetic energy."""
+    """The loss is a weighted sum of momentum and kinetic energy."""
     state, given = moved(sim), sim.default_parameters().replace(joint_armature=tensor([0.1, 0.2]))
     weights = scenes.tensor_noise((6,), 1.0, 7)
     of_state = hasattr(state, name)
@@ -439,10 +439,10 @@ def test_gradients_are_those_of_differences(sim, name):
     assert gradient.count_nonzero() > 0
     generator = torch.Generator().manual_seed(3)
     for _ in range(3):
-        # Relative, and zero where a mass is: it must not be negative.
+        # Relative perturbation, zero for zero masses, which must not become negative.
         d = torch.randn(x.shape, dtype=F64, generator=generator) * at.abs().max() * (at != 0)
         with torch.no_grad():
             ends = [value(at + sign * 1e-5 * d).item() for sign in (1, -1)]
-        # Of second order: 1e-10 of the value, rounding 1e-16 / 1e-5 of it.
+        # Relative errors: 1e-10 by truncation (second order), 1e-16 / 1e-5 by rounding.
         expected = (gradient * d).sum().item()
         assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(expected, rel=1e-7, abs=1e-10), name

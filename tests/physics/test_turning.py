@@ -1,4 +1,4 @@
-"""What turns as one does not slide: friction in grips and between sheets that spin."""
+"""Objects that rotate together do not slide: friction in grips and between spinning sheets."""
 
 import math
 
@@ -14,12 +14,12 @@ SLIP = 1e-3  # [m/s]
 
 
 def creep(share):
-    """Speed at which a load sticks that is this share of what friction can hold [m/s]."""
+    """Creep speed of a sticking load that is this share of the largest friction [m/s]."""
     return SLIP * (1 - math.sqrt(1 - share))
 
 
 def turned(poses, angle):
-    """Poses turned about the z axis, and the matrix of that turn."""
+    """Poses rotated about the z axis, and the matrix of the rotation."""
     q = quaternion([0, 0, 1], angle)
     R = tensor(matrix(q))
     turns = quaternion_multiply(tensor(q).expand(len(poses), 4), poses[:, 3:])
@@ -34,8 +34,8 @@ def plate(x, y, name):
 
 
 @pytest.mark.parametrize("barrier_distance", [5e-4, 4e-3])
-def test_what_a_grip_holds_creeps_no_more_when_it_turns_around(barrier_distance):
-    """A box between two plates, drawn along their axis by a third of what they hold."""
+def test_a_held_box_creeps_no_more_in_a_turning_grip(barrier_distance):
+    """A box between two plates, pulled by a third of the largest friction."""
     side, seconds, dt = 0.05, 1.0, 0.02
     x = side / 2 + 0.01 + 0.6 * barrier_distance
     box = dc.RigidBody.box((side, 0.04, 0.035), motion="dynamic", mass=0.1, friction=0.5)
@@ -61,16 +61,16 @@ def test_what_a_grip_holds_creeps_no_more_when_it_turns_around(barrier_distance)
 
 
 def spinning_sheets(share):
-    """Two sheets in a hand that spins: how far they get out of it in 40 ms [m].
+    """Distance by which two sheets leave a spinning hand in 40 ms [m].
 
-    They weigh so little, and the hand spins so fast, that they need this share of what it can hold.
+    The sheets' weight and the hand's spin require the share `share` of the largest friction.
     """
     radius, side, dt, d_hat, mu = 0.1, 0.08, 0.004, 2e-3, 0.4
     material = dc.Material(stretch=500, bending=1e-4, friction=mu, density=0.2, damping=0.01)
     upright = quaternion([0, 1, 0], math.pi / 2)
     gap = 0.6 * d_hat
     sheets = [
-        # Not edge on edge.
+        # Different meshes and angles avoid coincident edges.
         dc.Cloth.grid(
             n,
             n,
@@ -143,7 +143,7 @@ def test_two_boxes_that_spin_as_one_keep_their_spin(barrier_distance):
     )
 
     def press(state, turn):
-        """Along the line between the centers where it will be, so that there is hardly a couple."""
+        """Press along the line between the centers at the end of the step: nearly no couple."""
         way = state.body_poses[0, :3] - state.body_poses[1, :3]
         R = tensor(matrix(quaternion([1, 0, 0], turn)))
         along = force * R @ (way / way.norm())
@@ -165,7 +165,7 @@ def test_two_boxes_that_spin_as_one_keep_their_spin(barrier_distance):
             state.body_poses[:, :3], sim.contact_wrenches(state).values(), strict=True
         ):
             impulse += dt * (wrench[3:] + torch.linalg.cross(place, wrench[:3]))
-    # What contact has done to their angular momentum: what the gap changes by in a step.
+    # Angular impulse of contact: only due to the change of the gap in a step.
     assert impulse.norm() < 1e-3 * momentum
     rates = state.body_velocities[:, 3]
     assert rates[0] == pytest.approx(rates[1].item(), abs=1e-3)
@@ -173,7 +173,7 @@ def test_two_boxes_that_spin_as_one_keep_their_spin(barrier_distance):
 
 @pytest.mark.parametrize("turn", [0.2, 0.8])
 def test_gradients_of_a_grip_that_turns_are_those_of_differences(turn):
-    """Of where a box ends that slips a little, by the turn, the pressing pose and friction."""
+    """Final pose of a slightly slipping box, by the rotation, the pressing pose and friction."""
     d_hat = 2e-3
     x = 0.025 + 0.01 + 0.5 * d_hat
     box = dc.RigidBody.box((0.05, 0.04, 0.035), motion="dynamic", mass=0.1, friction=0.5)
@@ -224,7 +224,7 @@ def test_gradients_of_a_grip_that_turns_are_those_of_differences(turn):
 
 @pytest.mark.parametrize("gap", [0.002, 0.012, 0.028])
 def test_a_ball_that_strikes_at_a_slant_turns_by_its_radius(gap):
-    """Whatever is left of the gap when the step begins; friction is that of sliding."""
+    """For any gap at the start of the step, with sliding friction."""
     radius, mass, inertia, friction, dt = 0.04, 0.3, 0.5, 0.3, 0.01
     ball = dc.RigidBody.sphere(
         radius,
@@ -249,7 +249,7 @@ def test_a_ball_that_strikes_at_a_slant_turns_by_its_radius(gap):
     state = sim.step(state.replace(body_velocities=velocities))
     change = state.body_velocities[0] - velocities[0]
     left = state.body_poses[0, 2].item() - radius
-    assert change[2] > 0.1  # it has struck
+    assert change[2] > 0.1  # the ball has struck
     assert -change[0] == pytest.approx(friction * change[2].item(), rel=1e-2)
     lever = inertia * change[4] / (mass * -change[0])
     assert lever == pytest.approx(radius + left, rel=1e-3)
@@ -258,7 +258,7 @@ def test_a_ball_that_strikes_at_a_slant_turns_by_its_radius(gap):
 @pytest.mark.parametrize("turn", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("smooth", [True, False])
 def test_friction_about_a_body_that_spins_is_that_of_its_radius(smooth, turn):
-    """What a free plate loses at a ball that spins against it, the ball gains."""
+    """A spinning ball gains the angular momentum that a free plate loses."""
     radius, friction, dt = 0.05, 0.3, 0.01
     ball = dc.RigidBody.sphere(
         radius,
@@ -289,8 +289,7 @@ def test_friction_about_a_body_that_spins_is_that_of_its_radius(smooth, turn):
     created, taken = torch.zeros(3, dtype=F64), 0.0
     for _ in range(4):
         after = sim.step(state)
-        # Angular momentum is about places at the end, where the velocities at the start did not
-        # lead.
+        # Angular momentum is about final positions, to which the start velocities did not lead.
         drift = (
             dt
             * masses

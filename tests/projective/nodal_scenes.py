@@ -16,7 +16,7 @@ BODIES = {
     "capsule": (lambda **k: dc.RigidBody.capsule(0.2, 0.3, **k), 0.2, (0.7, 0.7, 0.03, 0.1)),
     "box": (lambda **k: dc.RigidBody.box((0.34, 0.29, 0.4), **k), 0.2, (1.3, 0.02, 0.03, 0.2)),
 }
-# Friction, velocity of the sheet: most vertices in contact then stick, slip, or some take off.
+# Friction and velocity of the sheet for which most vertices stick or slip, or some take off.
 CASES = {
     "sticking": (1.0, (0.0, 0.0, -0.1)),
     "slipping": (0.2, (1.2, 0.7, -0.1)),
@@ -48,7 +48,7 @@ class Step:
 
 
 def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, drag=0.0, **options):
-    """A step of a sheet on a body whose frame is turned, with a pin and a soft pin."""
+    """A step of a sheet with a pin and a soft pin on a body with a rotated frame."""
     make, top, turn = BODIES[kind]
     friction, velocity = CASES[case]
     vertices, faces = grid(6, 6, seed=3)
@@ -102,7 +102,7 @@ def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, dr
 
 
 def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
-    """A sheet that falls on another one and slides over it; nothing else holds them."""
+    """A sheet falls onto another sheet and slides over it; there are no pins or bodies."""
     edge = 0.1
     lower, faces = grid(5, 5, seed=1, jitter=0.05)
     upper = lower + np.array([0.3 * edge, 0.1 * edge, 0.8 * edge])
@@ -130,10 +130,10 @@ def assert_gradients_are_those_of_differences(value, inputs, sizes, generator, m
     """Compare the gradient of a function of named inputs with central differences.
 
     Args:
-        value: Maps a table of changed inputs to a scalar.
+        value: Function from a table of changed inputs to a scalar.
         inputs: Name -> tensor.
         sizes: Name -> step of the differences.
-        generator: Of the directions.
+        generator: Random generator of the directions.
         most: Largest relative error.
     """
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in inputs.items()}
@@ -150,6 +150,6 @@ def assert_gradients_are_those_of_differences(value, inputs, sizes, generator, m
 
 
 def counts(state):
-    """How many vertices take off, stick and slip."""
+    """Numbers of vertices that take off, stick and slip."""
     table = state.report.counts
     return table["taking_off"], table["sticking"], table["slipping"]

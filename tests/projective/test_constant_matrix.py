@@ -89,8 +89,8 @@ def test_matrices_that_differ_in_one_entry_are_told_apart(entry):
 
 
 @pytest.mark.slow
-def test_what_is_forgotten_is_made_again_with_the_same_bits():
-    """More matrices than the cache keeps: 32 MiB, and each takes up its values alone 1 MB."""
+def test_a_forgotten_matrix_is_remade_with_the_same_bits():
+    """More matrices than the cache of 32 MiB keeps; the values alone of each need 1 MB."""
     pairs = grid_graph(100, 100)
     matrices = _kernels.ConstantMatrices(pairs, np.zeros(10_000, bool))
     values, _ = random_values(pairs)

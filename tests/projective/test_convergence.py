@@ -42,7 +42,7 @@ def test_every_step_of_a_drape_converges(name, drape):
 
 @pytest.mark.quick("sphere")
 @pytest.mark.parametrize("name", ["sphere", "box"])
-def test_what_local_global_iterations_give_up_is_solved_by_newton(name, drape):
+def test_newton_solves_steps_that_local_global_iterations_give_up(name, drape):
     steps, local_global = drape(name, "projective")
     _, newton = drape(name, "newton")
     state = local_global.initial_state()
@@ -55,7 +55,7 @@ def test_what_local_global_iterations_give_up_is_solved_by_newton(name, drape):
         if not counts["left_to_newton"]:
             continue
         left += 1
-        # From the same start, so that the solution and its gradient are Newton's to the bit.
+        # Newton begins at the same start, so solution and gradient are equal to the bit.
         velocities = before.velocities.clone().requires_grad_()
         ends = [s.step(before.replace(velocities=velocities)) for s in (local_global, newton)]
         assert torch.equal(ends[0].positions, ends[1].positions)

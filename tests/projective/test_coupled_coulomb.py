@@ -1,4 +1,4 @@
-"""Coulomb's law at many contacts whose velocities depend on the impulses of all."""
+"""Coulomb's law at many contacts whose velocities depend on all impulses."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ def test_impulses_and_velocities_obey_the_law(m, friction, condition):
         r_n, u_n = (r * normals).sum(1), (u * normals).sum(1)
         r_t, u_t = r - r_n[:, None] * normals, u - u_n[:, None] * normals
         limit, pull, slip = friction * r_n, np.linalg.norm(r_t, axis=1), np.linalg.norm(u_t, axis=1)
-        # Signorini: no pull, no approach, and none of both at once.
+        # Signorini: no pull, no approach, and never force and separation at once.
         assert (r_n >= -small).all()
         assert (u_n >= -small).all()
         assert (np.minimum(r_n, u_n) <= small).all()
-        # Coulomb: within the cone, and where it slips on its border and against the slip.
+        # Coulomb: impulses are within the cone; at slip, on its border and opposed to the slip.
         assert (pull <= limit + small).all()
         slips = (r_n > small) & (slip > small)
         assert (np.abs(pull - limit)[slips] <= small).all()
@@ -51,7 +51,7 @@ def test_impulses_and_velocities_obey_the_law(m, friction, condition):
 
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_newtons_method_ends_what_twenty_sweeps_began(friction):
-    """Sweeps alone take up to eighty; a sweep too many says that the law is obeyed."""
+    """Sweeps alone need up to eighty; the last sweep only confirms the law."""
     for seed in range(5):
         W, q, normals = contacts(40, seed, 30.0)
         _kernels.solve_coulomb(

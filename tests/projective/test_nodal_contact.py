@@ -94,7 +94,7 @@ def test_forces_change_the_momentum(case, scheme):
 
 @pytest.mark.parametrize(("kind", "share"), [("plane", 0.3), ("box", 0.1)])
 def test_gradients_of_losses_add_up(kind, share):
-    """Each is solved for by itself, and as precisely as the equations of the step are."""
+    """Each loss has a separate adjoint solve, as precise as the step's equations."""
     step = on_body(kind, "slipping")
     v = (share * step.inputs["state.velocities"]).requires_grad_()
     positions = step({"state.velocities": v}).positions
@@ -105,8 +105,8 @@ def test_gradients_of_losses_add_up(kind, share):
 
 
 def test_the_normal_turns_with_the_vertex():
-    # On a sphere the gradient by positions is far off where the frame is taken for constant.
-    # It is the same sheet, sliding, with a derivative that only the frame has.
+    # On a sphere the gradient by positions is far off if the contact frame is kept constant.
+    # For this loss of a sliding sheet the derivative comes only from the frame.
     step = on_body("sphere", "slipping", moving=False)
     x = step.inputs["state.positions"].clone().requires_grad_()
     step({"state.positions": x}).velocities[:, 2].sum().backward()
@@ -191,7 +191,7 @@ def test_a_sheet_sticks_without_creep_below_its_friction_angle_and_slides_above(
 
 
 @pytest.mark.parametrize("tolerance", np.geomspace(1e-2, 1e-9, 8))
-def test_what_is_left_of_a_step_is_below_the_tolerance(tolerance):
+def test_the_residual_of_a_step_is_below_the_tolerance(tolerance):
     for case in CASES:
         after = on_body("sphere", case, tolerance=float(tolerance))()
         assert after.report.residual <= tolerance
@@ -206,11 +206,11 @@ def test_a_slide_accelerates_as_coulomb_says():
 
 
 @pytest.mark.parametrize("excess", [1e-2, 1e-5, 1e-7])
-def test_what_hardly_slips_is_hardly_moved_across(excess):
+def test_a_vertex_that_hardly_slips_hardly_moves_across(excess):
     """Friction turns with the slip: v_y = (1 - mu g_z / g_x) h g_y, for a small g_y."""
     h, mu = 0.01, 0.5
     sim, state, _ = patch(mu, dt=h)
-    # Soft: the size of a slip is then told by masses alone.
+    # Soft cloth: masses alone determine the size of a slip.
     given = sim.default_parameters().replace(
         stretch=torch.tensor(0.01, dtype=F64), bending=torch.tensor(1e-8, dtype=F64)
     )
@@ -224,7 +224,7 @@ def test_what_hardly_slips_is_hardly_moved_across(excess):
 
 @pytest.mark.parametrize(("v_0", "mu"), [(2.0, 0.5), (10.0, 0.8)])
 def test_stopping_distance_and_its_gradients(v_0, mu):
-    # Implicit Euler of a = -mu g: v_k = v_0 - k mu g h until it stops in the last, shorter step.
+    # Implicit Euler of a = -mu g: v_k = v_0 - k mu g h until the stop in the last, shorter step.
     h = 0.01
     sim, state, _ = patch(mu, dt=h)
     speed = torch.tensor(v_0, dtype=F64, requires_grad=True)
@@ -246,7 +246,7 @@ def test_stopping_distance_and_its_gradients(v_0, mu):
 
 
 def test_nothing_holds_what_falls_straight_down_on_a_smooth_floor():
-    """Without friction it slips even where it has not slipped: its velocity along it is its own."""
+    """Without friction a vertex slips even at zero slip: its tangential velocity is free."""
     sim, state, _ = patch(0.0)
     velocities = torch.zeros_like(state.velocities)
     velocities[:, 2] = -0.1
@@ -281,13 +281,13 @@ def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
     torch.testing.assert_close(force.sum(), -weight, rtol=1e-6, atol=0)
     points = state.positions.clamp(-0.5, 0.5)
     center = force @ torch.tensor(floor.vertices) / force.sum()
-    # Vertices of the sheet weigh unlike each other.
+    # Vertices of the sheet have different weights.
     torch.testing.assert_close(center[:2], points.mean(0)[:2], rtol=0, atol=0.01)
 
 
 @pytest.mark.parametrize("thick", [0, 1])
-def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
-    """One of two sheets that glide low over a floor is thick and rough."""
+def test_cloths_touch_at_their_own_thickness_and_friction(thick):
+    """Two sheets glide low over a floor; one sheet is thick and rough."""
     sheets = [
         dc.Cloth.grid(
             3,
@@ -313,7 +313,7 @@ def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
 
 @pytest.mark.parametrize("thick_first", [True, False])
 def test_a_vertex_touches_the_body_whose_band_it_is_deepest_in(thick_first):
-    """It is nearer to the surface of a thin wall, but deeper in the band of a thick floor."""
+    """The vertex is nearer to a thin wall's surface, but deeper in the band of a thick floor."""
     floor = dc.RigidBody.plane(1.0, thickness=0.04, nodal_contact=True)
     wall = dc.RigidBody.plane(
         1.0, pose=[-1e-3, 0, 0, 1, 0, 1, 0], thickness=4e-3, nodal_contact=True
@@ -326,7 +326,7 @@ def test_a_vertex_touches_the_body_whose_band_it_is_deepest_in(thick_first):
     assert after.report.contacts["cloth0", f"body{1 - thick_first}"].count == 9
 
 
-def test_an_obstacle_carries_what_sticks_to_it():
+def test_an_obstacle_carries_a_sticking_sheet():
     sim, state, _ = patch(0.8)
     body = sim.scene.bodies[0]
     moving = dc.RigidBody.plane(
@@ -352,11 +352,11 @@ def test_an_obstacle_carries_what_sticks_to_it():
 
 
 @pytest.mark.parametrize("missing", [1e-9, 0.1, 0.24, -0.01])
-def test_what_arrives_at_the_very_end_of_a_step_touches(missing):
+def test_a_sheet_that_arrives_at_the_very_end_of_a_step_touches(missing):
     """The floor stops a sheet that would enter in the last quarter of the step, and no other."""
     sim, state, _ = patch(0.5)
     gap, speed = 1e-3, 1.0
-    # Free fall would end this share of the way below where it touches.
+    # Free fall would end below the height of contact by the share `missing` of its path.
     way = DT * (speed + DT * G)
     x = state.positions.clone()
     x[:, 2] = gap + way * (1 - missing)
@@ -367,7 +367,7 @@ def test_what_arrives_at_the_very_end_of_a_step_touches(missing):
 
 
 def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
-    """A box passes by and turns: only halfway is it at the sheet."""
+    """A box passes by and rotates; only halfway is the box at the sheet."""
     sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[0, 0, 0.045, 1, 0, 0, 0])
     start = [-0.5, 0.01, -0.01, 1.0, 0.02, -0.03, 0.3]
     box = dc.RigidBody.box(
@@ -426,7 +426,7 @@ def test_split_leaves_nodal_bodies_out_of_the_barrier():
 
 @pytest.mark.parametrize("metric", ["energy", "elastic"])
 def test_gradients_of_nodes_and_barrier_in_one_step_are_those_of_differences(metric):
-    """What nodes feel in the first stage of split lasts in the second, where a ball presses."""
+    """Nodal contact forces of split's first stage persist in the second, where a ball presses."""
     step = on_body("plane", "slipping", scheme="split", moving=False)
     (cloth,), (floor,) = step.sim.scene.cloths, step.sim.scene.bodies
     at = step.state.positions.mean(0) + torch.tensor([0.01, 0.02, 0.0335], dtype=F64)

@@ -23,7 +23,7 @@ def nearest(kind, point):
 def test_the_nearest_point_is_that_of_a_search(kind):
     charts, inside = SOLIDS[kind][1]
     rng = np.random.default_rng(0)
-    # Few of those around a solid are inside, where its sides differ in other signs.
+    # Few random points are inside the solid; the sample must include both signs of each axis.
     within = [y for y in rng.uniform(-0.6, 0.6, (400, 3)) if inside(y)][:15]
     assert (np.sign(within).min(0) < 0).all()
     assert len(within) == 15
@@ -62,7 +62,7 @@ def test_derivatives_are_those_of_differences(kind):
 
 
 @pytest.mark.parametrize("kind", SOLIDS)
-def test_where_many_points_are_nearest_one_normal_is_taken(kind):
+def test_a_single_normal_is_chosen_among_many_nearest_points(kind):
     distance, normal, *_ = nearest(kind, (0.0, 0.0, 0.0))
     assert distance < 0.0
     assert np.linalg.norm(normal) == 1.0

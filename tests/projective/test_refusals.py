@@ -1,4 +1,4 @@
-"""What nodes cannot touch, and what a scheme cannot take, is refused by name."""
+"""Bodies without nodal contact, and inputs that a scheme does not support, are refused by name."""
 
 import pickle
 

@@ -71,7 +71,7 @@ def test_gradients_of_pairs_are_those_of_differences(friction):
 def test_self_contact_is_what_the_options_say():
     lower, faces = grid(5, 5, seed=1, jitter=0.05)
     folded = lower.copy()
-    # One half of the sheet turned over the other, closer than its vertices' spheres.
+    # One half of the sheet is folded over the other, closer than the vertices' spheres.
     over = folded[:, 0] > 0.02
     folded[over, 0] = 0.04 - folded[over, 0]
     folded[over, 2] += 0.05

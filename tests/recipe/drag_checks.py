@@ -1,4 +1,4 @@
-"""Gradients of the example of docs/extending.md against differences, where it has been applied."""
+"""Gradients of the example of docs/extending.md against differences; runs in the extended copy."""
 
 from dataclasses import replace
 from functools import cache
@@ -23,7 +23,7 @@ SOLVERS = [
 ]
 
 
-def test_this_is_the_copy():
+def test_the_tested_package_is_the_copy():
     assert Path(dc.__file__).is_relative_to(Path(__file__).parents[2])
     assert "drag" in vars(dc.Parameters)
 
@@ -39,12 +39,12 @@ def losses_of(after, count=2):
 
 
 def check_gradients(step, given, sizes, rtol=1e-5):
-    """Of two losses at once: each as alone, and as central differences in some directions.
+    """Check gradients of two losses at once, against single losses and central differences.
 
     Args:
-        step: Takes the step from values by name.
-        given: These values.
-        sizes: Of the differences in each.
+        step: Function from named values to the state after a step.
+        given: Values by name.
+        sizes: Step of the differences for each value.
     """
     leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
     outputs, cotangents = losses_of(step(**leaves))
@@ -88,7 +88,7 @@ def sheet(scheme, metric, elastic):
 
 
 def gradients_of(sim, state, drag):
-    """Check those of drag, and of what its weights and its motion follow from."""
+    """Check gradients by drag, and by the rest positions and positions that drag depends on."""
 
     def step(drag, rest_positions, positions):
         parameters = sim.default_parameters().replace(drag=drag, rest_positions=rest_positions)

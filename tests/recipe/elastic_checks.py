@@ -1,4 +1,4 @@
-"""A scheme without contact, the example of docs/extending.md, where it has been applied."""
+"""A scheme without contact, the example of docs/extending.md; runs in the extended copy."""
 
 import torch
 from differences import difference
@@ -12,12 +12,12 @@ def simulator(scheme, **options):
     return dc.Simulator(dc.Scene([cloth], **options), 0.01, scheme=scheme)
 
 
-def test_it_has_a_name_and_abilities():
+def test_the_scheme_has_a_name_and_abilities():
     assert list(_core.schemes)[-1] == "elastic"
     assert _core.schemes["elastic"]["barrier"] is False
 
 
-def test_it_is_the_coupled_scheme_where_nothing_touches():
+def test_the_scheme_equals_the_coupled_scheme_without_contact():
     ends = []
     for scheme in ("coupled", "elastic"):
         sim = simulator(scheme)

@@ -1,4 +1,4 @@
-"""Copies of the sources with an example of docs/extending.md applied, compiled where it changed."""
+"""Copies of the sources with an example of docs/extending.md applied; changed files compiled."""
 
 import os
 import re
@@ -37,14 +37,14 @@ def changes_of_page(text: str) -> dict[str, list[str]]:
 
 
 def patched(path: str, text: str, lines: list[str]) -> str:
-    """A file with the lines of a diff without numbers: each hunk stands behind the one before it.
+    """A file after a diff without line numbers: each hunk applies behind the previous hunk.
 
-    A line to add stands behind the line above it in the diff, or before the next one that stays.
+    An added line goes behind the line above it in the diff, or before the next context line.
     """
     place = 0
     hunk: list[str] = []
     for line in [*lines, None]:
-        # What has been added ends a hunk where a line of the file follows that is not next to it.
+        # A context line that is not adjacent in the file ends a hunk.
         if line is not None and (line[0] == "+" or not hunk or _follows(text, place, hunk, line)):
             hunk.append(line)
             continue
@@ -96,7 +96,7 @@ def make_tree(folder: Path, title: str) -> set[str]:
 
 
 def find_build() -> Path | None:
-    """The newest build of these sources as users have it; None where there is none."""
+    """The newest build of these sources with users' options; None if there is no build."""
     found = []
     for cache in ROOT.glob("build/*/CMakeCache.txt"):
         text = cache.read_text()
@@ -111,12 +111,12 @@ def find_build() -> Path | None:
 
 
 def compile_core(tree: Path, changed: set[str], build: Path) -> int:
-    """Compile and install the core of a tree; the number of files that had to be compiled.
+    """Compile and install the core of a tree; return the number of compiled files.
 
     Args:
         tree: The sources.
-        changed: Paths of what differs from the sources of the build.
-        build: Objects of all that does not depend on these.
+        changed: Paths of files that differ from the sources of the build.
+        build: Build folder with the objects that do not depend on changed files.
     """
     cache = (build / "CMakeCache.txt").read_text()
     compiler = re.search(r"^CMAKE_CXX_COMPILER:\w+=(.*)$", cache, re.MULTILINE)[1]
@@ -127,7 +127,7 @@ def compile_core(tree: Path, changed: set[str], build: Path) -> int:
         *(f"-DCMAKE_CXX_COMPILER={compiler}", f"-DCMAKE_CXX_FLAGS={flags}"),
         *("-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG", f"-DPython_EXECUTABLE={sys.executable}"),
     )
-    # Ninja has no record of objects that it has not made: its commands are run without it.
+    # Ninja has no record of objects from another build; therefore its commands run directly.
     commands = _run("ninja", "-C", own, "-t", "commands", "_core").splitlines()
     dirty = _dependents(tree / "csrc", {p.removeprefix("csrc/") for p in changed})
     headers: list[str] = []  # to be compiled before all else
@@ -162,7 +162,7 @@ def compile_core(tree: Path, changed: set[str], build: Path) -> int:
 
 
 def _dependents(csrc: Path, changed: set[str]) -> set[str]:
-    """All files that include, over whatever others, one that has changed; and these."""
+    """Changed files, and all files that include a changed file directly or indirectly."""
     includes = {
         path.relative_to(csrc).as_posix(): set(_INCLUDE.findall(path.read_text()))
         for path in csrc.rglob("*")

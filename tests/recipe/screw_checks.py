@@ -1,4 +1,4 @@
-"""Robots with lead screws, the example of docs/extending.md, where it has been applied."""
+"""Robots with lead screws, the example of docs/extending.md; runs in the extended copy."""
 
 import math
 from functools import cache
@@ -74,7 +74,7 @@ def judge(pin, mechanism):
     return model, joint
 
 
-def test_this_is_the_copy(tmp_path):
+def test_the_tested_package_is_the_copy(tmp_path):
     assert Path(dc.__file__).is_relative_to(Path(__file__).parents[2])
     assert load(tmp_path).mechanism.kind == ("fixed", "screw", "revolute", "screw")
 
@@ -194,7 +194,7 @@ def test_gradients_of_steps_in_contact(folder, actuation, name):
 
 
 def test_an_equilibrium_carries_the_weight(folder):
-    """The drives of an arm at rest have the efforts that Pinocchio has for it."""
+    """The drives of an arm at rest have the efforts that Pinocchio computes."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
     robot = load(folder, actuation="pd", stiffness=2.0)
     sim = dc.Simulator(dc.Scene([], robots=[robot]), 0.01)

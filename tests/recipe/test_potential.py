@@ -1,4 +1,4 @@
-"""The example of docs/extending.md, applied to a copy: a potential works as it says."""
+"""The potential of docs/extending.md, applied to a copy of the sources, works as described."""
 
 import extended_tree
 import pytest

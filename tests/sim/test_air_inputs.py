@@ -1,4 +1,4 @@
-"""Drag, the density of the air and wind, where they enter."""
+"""Drag, air density and wind as inputs: defaults and refused values."""
 
 import numpy as np
 import pytest

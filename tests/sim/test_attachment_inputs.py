@@ -1,4 +1,4 @@
-"""What attachments and their controls accept, and what they refuse by name."""
+"""Accepted and refused inputs of attachments and their controls."""
 
 import re
 
@@ -151,8 +151,8 @@ def test_a_control_refuses(sim, control, message):
         sim.step(sim.initial_state(), dc.Control(**tensors))
 
 
-def test_each_attachment_pulls_to_its_own_targets():
-    """What they store, by hand; they may be set together or by name."""
+def test_attachments_pull_to_their_own_targets():
+    """Stored energies computed by hand; targets may be set together or by name."""
     first = dc.Attachment(("sheet", [0, 2]), stiffness=5.0, name="first")
     between = dc.Attachment(("sheet", 4), ("box", [0, 0, 0]), stiffness=0.1)
     second = dc.Attachment(("sheet", [1, 3, 5]), stiffness=[1.0, 2.0, 3.0], name="second")
@@ -180,8 +180,8 @@ def test_no_environment_is_pulled_to_a_target_that_is_not_set(sim):
         sim.step(sim.initial_state(3), pulled)
 
 
-def test_what_a_control_does_not_say(sim):
-    """Without a target a picker is released; with one it pulls with all of its stiffness."""
+def test_unset_fields_of_a_control_have_defaults(sim):
+    """Without a target a picker is released; with a target it pulls with its full stiffness."""
     state = sim.initial_state()
     targets = state.positions[[0, 2]] + 0.05
     released = sim.control(attachment_weights={"picker": [0.0, 0.0], "grasp": [1.0]})

@@ -1,4 +1,4 @@
-"""One typed error for each bad argument that once raised another's, or none."""
+"""One typed error for each bad argument that once raised another error, or none."""
 
 import io
 import os
@@ -142,7 +142,7 @@ def test_a_nested_tensor_is_a_type_error(sim, call, layout):
 
 
 def broken(report, **changes):
-    """A report as a file may hold it: made without its own checks."""
+    """A report made without checks, as a file may contain."""
     made = object.__new__(dc.Report)
     made.__dict__.update(vars(report) | changes)
     return made
@@ -257,7 +257,7 @@ def test_little_memory_is_a_memory_error_and_no_end(threads):
     assert int(re.fullmatch(r"refused (\d+)\n", printed)[1]) > 5
 
 
-# --- Where surfaces start ------------------------------------------------------------------------
+# --- Start positions of surfaces -----------------------------------------------------------------
 
 
 def two_sheets(*position):
@@ -303,7 +303,7 @@ def test_a_rest_shape_without_area_is_refused_in_every_environment(sim):
 
 
 def test_a_cloth_may_be_finer_than_a_body_is_thick():
-    """Only cloths must not reach from one of their parts to the next."""
+    """Only a cloth's thickness must stay below its own edge lengths."""
     floor = dc.RigidBody.plane(4.0, thickness=0.3, pose=[0, 0, -1, 1, 0, 0, 0], name="floor")
     scene = dc.Scene([dc.Cloth.grid(5, 5, 0.2, name="sheet")], [floor])
     sim = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=0.005))

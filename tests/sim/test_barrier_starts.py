@@ -1,4 +1,4 @@
-"""What starts inside the barrier is thrown by it, and the first step warns of that."""
+"""Surfaces that start inside the barrier are thrown by it, and the first step warns."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def fastest(state, simulator):
 
 
 def check_speed(simulator, steps, factor=2.0):
-    """The speed of the warning is the one that is measured, within a factor."""
+    """Check that the speed in the warning equals the measured speed within a factor."""
     states, (text,) = warnings_of(simulator, simulator.initial_state(), steps)
     measured = max(fastest(state, simulator) for state in states)
     assert measured / factor < speed_in(text) < factor * measured
     return text
 
 
-# --- How fast ------------------------------------------------------------------------------------
+# --- Speed of the throw --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.02, 2), (4e-3, 4), (5e-4, 12)])
@@ -122,7 +122,7 @@ def test_cloths_and_bodies_are_thrown_as_fast_as_the_warning_says(make, dt):
 
 
 def gripper_over_a_sheet(gap, **drives):
-    """The gripper that comes along, its fingers above a sheet."""
+    """The package's gripper with its fingers above a sheet."""
     hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0, 0, 0.3, 0, 1, 0, 0], name="hand", **drives)
     away = dc.Simulator(dc.Scene([sheet(0.0)], robots=[hand], gravity=WEIGHTLESS), 0.01)
     placed = away.initial_state().meshes()
@@ -135,8 +135,8 @@ def gripper_over_a_sheet(gap, **drives):
     "drives", [{"actuation": "position"}, {"stiffness": 200.0}, {"actuation": "torque"}]
 )
 def test_a_link_over_a_sheet_throws_it(drives):
-    # Neighbors of the few vertices that are pushed take part of the push, which the first one
-    # does not show: measured 2.2.
+    # Neighbors of the few pushed vertices absorb a part of the push, which the warning does not
+    # include: measured factor 2.2.
     text = check_speed(gripper_over_a_sheet(6e-4, **drives), 2, factor=2.5)
     assert re.search(r"cloth 'cloth0' .* and link 'hand/\w+_finger' ", text)
     assert not warnings_of(*with_start(gripper_over_a_sheet(2.1e-3, **drives)))[1]
@@ -146,7 +146,7 @@ def with_start(simulator):
     return simulator, simulator.initial_state()
 
 
-# --- Which, and once -----------------------------------------------------------------------------
+# --- Named pairs, one warning --------------------------------------------------------------------
 
 
 def test_the_fastest_pair_and_its_remedies_are_named():
@@ -161,7 +161,7 @@ def test_the_fastest_pair_and_its_remedies_are_named():
     nearer = float(re.search(r"of at most (\S+) m$", text)[1])
     assert farther == pytest.approx(1.2e-3)
     assert nearer == pytest.approx(8e-4)
-    # Each of the two remedies is one: the crate is no longer named.
+    # Each of the two remedies works: the crate is no longer named.
     mended = dc.Scene([cloth], [FLOOR, box(8e-4 + farther, name="crate")])
     _, texts = warnings_of(*with_start(dc.Simulator(mended, 0.01, contact=FINE)))
     assert "crate" not in "".join(texts)
@@ -212,7 +212,7 @@ def test_derivatives_and_velocities_of_a_start_change_nothing():
     zero = torch.zeros(3, dtype=torch.float64)
     with pytest.warns(dc.BarrierStartWarning) as caught:
         torch.func.jvp(end, (zero,), (zero + 1,))
-    # The first jvp of a process makes torch warn, too.
+    # Torch also warns at the first jvp of a process.
     ours = [w for w in caught if w.category is dc.BarrierStartWarning]
     assert [str(w.message) for w in ours] == [plain]
 
@@ -238,7 +238,7 @@ def test_throws_below_a_centimeter_a_second_do_not_warn():
 def test_pinned_cloth_and_static_bodies_do_not_warn():
     scene = dc.Scene([sheet(1e-3, pins={"all": range(36)})], [FLOOR])
     assert not warnings_of(*with_start(dc.Simulator(scene, 0.01, contact=FINE)))[1]
-    # What moves of a sheet does.
+    # The free part of a sheet warns.
     scene = dc.Scene([sheet(1e-3, pins={"edge": range(6)})], [FLOOR])
     assert warnings_of(*with_start(dc.Simulator(scene, 0.01, contact=FINE)))[1]
 
@@ -254,7 +254,7 @@ def test_a_force_that_holds_against_the_barrier_holds_the_warning_back():
 
 
 @pytest.mark.parametrize("how", ["rollout", "equilibrium"])
-def test_what_rests_in_the_barrier_does_not_warn(how):
+def test_a_surface_at_rest_in_the_barrier_does_not_warn(how):
     # A sheet that is held on a table and hangs over its edge.
     table = dc.RigidBody.box((0.2, 0.3, 0.1), pose=[0, -0.15, -0.05, 1, 0, 0, 0])
     cloth = dc.Cloth.grid(
@@ -271,7 +271,7 @@ def test_what_rests_in_the_barrier_does_not_warn(how):
         assert not texts
     assert rest.report.contact_count > 0
     again = pickle.loads(pickle.dumps(rest))
-    # A report says that a step has led here; without one, forces balance.
+    # A state with a report results from a step; a state without a report has balanced forces.
     assert not warnings_of(dc.Simulator(scene, 0.01, contact=FINE), again)[1]
     bare = rest.replace(report=None)
     assert not warnings_of(dc.Simulator(scene, 0.01, contact=FINE), bare)[1]
@@ -289,7 +289,7 @@ def test_a_stack_that_rests_in_the_barrier_does_not_warn():
     assert rest.body_velocities.abs().max() < 1e-3
     bare = rest.replace(report=None)
     assert not warnings_of(dc.Simulator(scene, 0.01, contact=FINE), bare)[1]
-    # What carries the upper box is too much for the lower one alone.
+    # The force that carries both boxes is too large for the lower box alone.
     poses = bare.body_poses.clone()
     poses[2, 2] += 0.1
     lighter = bare.replace(body_poses=poses)

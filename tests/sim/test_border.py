@@ -1,4 +1,4 @@
-"""The border to C++: the core reads arrays by the sizes that it expects, and must refuse others."""
+"""The border to C++: the core reads arrays by expected sizes, and must refuse other sizes."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_the_inputs_are_good_ones(sim, inputs, forward):
 
 
 def wrong(array):
-    """Arrays of other sizes: each is shorter, longer or of other rows than it should be."""
+    """Arrays of wrong sizes: shorter, longer or with other rows."""
     flat = array.reshape(len(array), -1)
     return {
         "a number less": flat[:, :-1].copy(),
@@ -112,7 +112,7 @@ WOVEN = {
 @pytest.mark.parametrize("name", _core.input_names)
 def test_an_input_of_another_size_is_refused(sim, inputs, forward, name, kind):
     bad = inputs | {name: wrong(inputs[name])[kind]}
-    # Three rows of positions are a batch of three, whose other inputs are shared.
+    # Three rows of positions are a batch of three environments that share the other inputs.
     batch = name == "positions" and kind == "three rows"
     calls = [
         lambda: sim._core.forward(bad, True, 1),
@@ -160,7 +160,7 @@ def test_an_input_that_is_not_there_is_refused(sim, inputs, name):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_tape_or_cotangent_of_another_size_is_refused(scheme, kind):
     sim = make()
-    if scheme == "split":  # it takes nothing that forces move
+    if scheme == "split":  # the scheme supports no dynamic bodies
         sim = dc.Simulator(dc.Scene([dc.Cloth.grid(4, 4)]), 0.01, scheme="split")
     tensors, _ = sim._inputs(sim.initial_state(), None, None)
     inputs = {name: as_array(tensor) for name, tensor in tensors.items()}
@@ -233,7 +233,7 @@ def test_hooks_on_saved_tensors_cannot_reach_the_core_with_something_else(sim, c
     assert sim.step(state).report.converged
 
 
-# --- What each step looks at first ---------------------------------------------------------------
+# --- Checks at the start of each step ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("at", [0, 3, 10])
@@ -262,12 +262,12 @@ def test_quaternions_have_a_length(shape, entry):
     assert not _core.have_quaternions(poses, 0.49)
 
 
-# --- What a core is made from --------------------------------------------------------------------
+# --- Arguments of a core -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def arguments():
-    """What the package hands to the core for the scene."""
+    """Arguments that the package passes to the core for the scene."""
     taken = {}
 
     class Spy:
@@ -334,7 +334,7 @@ def test_an_array_of_another_length_is_refused(arguments, name):
     array = arguments[name]
     for bad in (array.reshape(-1)[:-1], np.concatenate([array.reshape(-1)] * 2)):
         if name in ("pins", "soft_pins") or (name == "body_faces" and len(bad) % 3 == 0):
-            continue  # there may be any number of them
+            continue  # any number is valid
         with pytest.raises(REFUSED, match=r"core: |trees: "):
             _core.Simulator(**(arguments | {name: bad}))
 
@@ -385,7 +385,7 @@ def test_a_field_of_another_type_is_named(arguments):
 
 @pytest.mark.parametrize("rounded", [torch.tensor(0.01), np.float32(0.02), torch.tensor(1).half()])
 def test_a_time_step_in_single_precision_is_refused(rounded):
-    """0.01 becomes 0.009999999776482582 there, in silence."""
+    """Single precision would silently change 0.01 to 0.009999999776482582."""
     scene = dc.Scene([dc.Cloth.grid(3, 3)])
     message = r"Simulator: `dt` must be a plain number or one in float64, got \S*float\d+, which"
     with pytest.raises(TypeError, match=message):

@@ -1,4 +1,4 @@
-"""Contacts one by one: they add up to the forces of the state, and lie where surfaces touch."""
+"""Single contacts add up to the forces of the state, and lie at the contacts of surfaces."""
 
 from dataclasses import fields
 
@@ -63,7 +63,7 @@ def test_forces_add_up_to_those_of_the_report(step):
         between = contacts.pairs == torch.tensor([sim.surfaces.index(n) for n in (first, second)])
         rows = between.all(dim=-1)
         pressing = rows & (contacts.normal_forces != 0)
-        # Edges that are parallel to the last bit are counted, and press with nothing.
+        # Exactly parallel edges are counted, but have zero force.
         assert int(pressing.sum()) <= pairs[first, second].count <= int(rows.sum())
         assert pairs[first, second].count - int(pressing.sum()) <= 3
         if first != second:
@@ -82,7 +82,7 @@ def test_geometry_is_that_of_the_surfaces(step):
     assert (contacts.gaps[pressing] < sim.default_parameters().barrier_distance).all()
     assert float(distance[pressing].min()) == pytest.approx(state.report.minimum_distance, rel=1e-9)
     along = (contacts.tangential_forces * contacts.normals).sum(dim=-1).abs()
-    assert along.max() < 0.1 * contacts.forces.abs().max()  # of normals that are a solve old
+    assert along.max() < 0.1 * contacts.forces.abs().max()  # normals lag by one solve
 
 
 def test_points_lie_on_their_surfaces():
@@ -150,8 +150,8 @@ def test_a_sheet_that_slides_on_a_floor_obeys_coulomb_and_bears_its_weight(frict
     assert on_floor.points[:, 1, 2].abs().max() < 1e-12
     drag = on_floor.tangential_forces.sum(dim=0)
     assert float(drag[0]) == pytest.approx(friction * weight, rel=0.05)
-    # The moment of what acts at the points is that of what acts at the vertices, but for the couple
-    # that lets friction across a gap keep angular momentum.
+    # The moments of forces at points and at vertices agree, up to the couple by which friction
+    # across a gap conserves angular momentum.
     wrench = sim.contact_wrenches(state)["floor"]
     moment = torch.linalg.cross(on_floor.points[:, 1], on_floor.forces).sum(dim=0)
     couple = float(on_floor.gaps.max() * drag.norm())
@@ -163,7 +163,7 @@ def batch_of(states):
     return dc.stack(states)
 
 
-def test_environments_are_padded_and_those_alone():
+def test_environments_of_a_batch_are_padded_single_ones():
     sim = scenes.regime("sliding").sim
     start = scenes.regime("sliding").state
     lifted = start.replace(positions=start.positions + torch.tensor([0.0, 0.0, 0.05], dtype=F64))
@@ -213,7 +213,7 @@ def test_single_contacts_have_no_gradient_and_say_so():
     assert not case.sim.contacts(state.detach()).gaps.requires_grad
 
 
-def test_what_has_no_contacts_of_a_step_is_refused():
+def test_states_without_contacts_of_a_step_are_refused():
     sim = scenes.regime("sliding").sim
     with pytest.raises(dc.InvalidInput, match="`state` must be the result of a step"):
         sim.contacts(sim.initial_state())

@@ -1,6 +1,6 @@
 """The public contract of a simulator: names, checks, hold, batches, purity, autograd, saving.
 
-Nothing here depends on how accurate a step is; the physics and its gradients have their own tests.
+No test here depends on the accuracy of a step; other tests cover the physics and its gradients.
 """
 
 import copy
@@ -97,9 +97,9 @@ PUBLIC = {
 
 
 def make_scene():
-    """Two cloths above a floor that they do not reach in a few steps, and a box far away.
+    """Two cloths above a floor, which they do not reach in a few steps, and a distant box.
 
-    Coordinates are in general position, so that no gradient vanishes by symmetry.
+    Coordinates are in general position: no gradient vanishes by symmetry.
     """
     sheet = dc.Cloth.grid(
         4,
@@ -163,7 +163,7 @@ def test_build_info_is_a_dict():
     assert isinstance(dc.build_info(), dict)
 
 
-# --- What a simulator offers ---------------------------------------------------------------------
+# --- Attributes of a simulator -------------------------------------------------------------------
 
 
 def test_initial_state_has_the_shapes_of_the_scene(sim):
@@ -548,7 +548,7 @@ def test_batched_inputs_of_a_single_state_are_refused(sim):
         sim.step(sim.initial_state(2), dc.Control(forces=torch.zeros(3, VERTICES, 3)))
 
 
-def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
+def test_values_per_environment_or_per_cloth_must_be_distinguishable(sim):
     state, parameters = sim.initial_state(2), sim.default_parameters()
     with pytest.raises(
         dc.InvalidInput, match=r"^step: `parameters\.stretch` of shape \[2\] could .*\[2, 2\]"
@@ -561,7 +561,7 @@ def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
     sim.step(sim.initial_state(FACES), None, parameters.replace(stretch=500.0))
 
 
-def test_one_value_of_one_environment_and_one_cloth_is_both():
+def test_a_value_of_one_environment_and_one_cloth_is_both():
     sheet = dc.Cloth(np.eye(3), [[0, 1, 2]], name="sheet")  # of one face
     sim = dc.Simulator(dc.Scene([sheet]), DT)
     heavy = torch.tensor([0.7], dtype=F64)
@@ -700,7 +700,7 @@ def differentiable(sim, batch_size=None):
 
 
 @pytest.mark.parametrize("batch_size", [None, 2])
-def test_one_leaf_at_a_time_gets_the_gradient_of_all_together(sim, batch_size):
+def test_a_single_leaf_gets_the_gradient_of_all_leaves(sim, batch_size):
     state, leaf, control, parameters = differentiable(sim, batch_size)
 
     def loss(leaf, control, parameters):
@@ -773,7 +773,7 @@ def test_steps_with_backward_do_not_grow(sim):
 
 @pytest.mark.parametrize("function", [torch.sum, lambda x: (x**2).sum()], ids=["sum", "square"])
 def test_second_derivatives_are_refused(sim, function):
-    """Also where the cotangent has no graph, as for a sum."""
+    """This includes cotangents without a graph, as of a sum."""
     state = moved(sim)
     x = state.positions.clone().requires_grad_()
     total = function(sim.step(state.replace(positions=x)).positions)
@@ -919,7 +919,7 @@ def test_checkpoints_change_no_bit(sim, every, callable_controls):
 
 
 def test_arrays_may_be_used_again_behind_a_checkpoint(sim):
-    """A rollout copies what is no tensor: its steps are repeated as they were."""
+    """A rollout copies inputs that are no tensors: its steps are repeated unchanged."""
     gradients = []
     for edited in (False, True):
         x = moved(sim).positions.requires_grad_()

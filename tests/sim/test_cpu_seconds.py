@@ -25,7 +25,7 @@ def test_a_step_reports_processor_time():
     report = sim.step(sim.initial_state()).report
     spent = time.process_time() - begin
     assert 0.0 < report.cpu_seconds <= spent
-    # Clocks of the wall and of the processor are read one after the other; one thread works.
+    # Wall and processor clocks are read in turn; one thread works.
     assert report.cpu_seconds <= sum(report.seconds.values()) + 1e-3
 
 
@@ -40,7 +40,7 @@ def test_threads_that_share_factorizations_are_counted():
         spent = time.process_time() - begin
     finally:
         torch.set_num_threads(threads)
-    # The rest is spent in Python, and where threads wait for each other.
+    # The rest is time in Python and of threads that wait for each other.
     assert 0.7 * spent < report.cpu_seconds <= spent
 
 
@@ -66,7 +66,7 @@ def test_solves_of_a_staggered_coupling_add_up(coupling):
     assert 0 < report.cpu_seconds <= sum(report.seconds.values()) + 1e-3
 
 
-def test_it_is_saved_and_shown(tmp_path):
+def test_processor_time_is_saved_and_shown(tmp_path):
     sim = hanging(5)
     state = sim.step(sim.initial_state())
     torch.save(state, tmp_path / "state.pt")

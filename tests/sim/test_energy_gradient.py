@@ -1,4 +1,4 @@
-"""The gradient of the energy, part by part, by every input; and the forces that it is minus."""
+"""The gradient of each part of the energy by every input, and its relation to forces."""
 
 from functools import cache
 
@@ -43,7 +43,8 @@ OF_BODIES = {
     },
 }
 
-# Steps of the differences, in the units of an input; of the others, a share of its largest value.
+# Steps of the differences in units of the input; for all other inputs, relative to the largest
+# value.
 STEPS = {
     "state.positions": 1e-5,
     "state.soft_pin_targets": 1e-4,
@@ -119,7 +120,7 @@ def case(name):
 
 
 def inputs(sim, state):
-    """All tensors of a state and of parameters by their names."""
+    """All tensors of a state and of its parameters by name."""
     owners = {"state": state, "parameters": sim.default_parameters()}
     return {
         f"{owner}.{name}": tensor.detach()
@@ -154,7 +155,7 @@ def gradients(sim, state, part, names=None):
 
 
 REGIMES = {
-    "hanging": {"contact"},  # and what is zero there
+    "hanging": {"contact"},  # parts that are zero
     "curved": {"contact"},
     "hinge": {"contact"},
     "sticking": (),
@@ -217,7 +218,7 @@ def test_every_part_has_its_gradient_by_every_input(name):
                 )
                 for part in asked:
                     terms = found[part][key] * d
-                    # Directions that miss what a part depends on have no terms.
+                    # A direction may miss all entries on which a part depends.
                     scale = float(terms.norm() or found[part][key].norm())
                     error = abs(s[part] - float(terms.sum())) / scale
                     errors[part] = min(errors[part], error)
@@ -329,7 +330,7 @@ def test_a_batch_has_the_gradients_of_its_environments(name):
         w * g["parameters.barrier_stiffness"] for w, g in zip(weights, alone, strict=True)
     )
     torch.testing.assert_close(found[2], stiffness, rtol=1e-12, atol=0)
-    # What does not depend on an environment leaves it alone.
+    # An energy that does not depend on an environment has no gradient there.
     (one,) = torch.autograd.grad(
         sim.energy(batch.replace(positions=fields["positions"]))[1], fields["positions"]
     )
@@ -433,8 +434,8 @@ def test_the_gradient_is_minus_the_forces_of_a_step_without_friction():
 
 
 @pytest.mark.parametrize("soft", [False, True], ids=["pins", "soft_pins"])
-def test_it_vanishes_at_an_equilibrium(soft):
-    """At the free vertices; at pins it is what holds them."""
+def test_the_gradient_vanishes_at_an_equilibrium(soft):
+    """The gradient vanishes at free vertices; at pins it is the holding force."""
     vertices, faces = scenes.grid(7, 7, edge=0.04, seed=5)
     held = {"corners": [0, 6, 42, 48]}
     cloth = dc.Cloth(

@@ -1,4 +1,4 @@
-"""Equilibria: against closed forms, long rollouts and differences; and what has none."""
+"""Equilibria against closed forms, long rollouts and differences; scenes without equilibrium."""
 
 import dataclasses
 import importlib
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def cusick(monkeypatch):
-    """A disk over a pedestal, and rollouts of it."""
+    """The benchmark of a disk over a pedestal, with its rollouts."""
     monkeypatch.syspath_prepend(ROOT)
     return importlib.import_module("benchmarks.drape_coefficient")
 
@@ -92,8 +92,8 @@ def test_a_hanging_strip_is_a_catenary():
     )
     sim = dc.Simulator(dc.Scene([held]), 0.01, solver=dc.SolverOptions(max_iterations=3000))
     end = sim.equilibrium(sim.initial_state())
-    # A chain of 39 links, each with the weight of its ends: below its middle a link pulls up with
-    # the weight of the links between, so that tan(theta_i) = (i - 19) / pull.
+    # A chain of 39 links, each with the weight of its ends: a link carries the weight of the links
+    # between itself and the middle, so tan(theta_i) = (i - 19) / pull.
     link, places = length / 39, np.arange(39) - 19
 
     def angles(pull):
@@ -125,7 +125,7 @@ def test_a_heavy_cantilever_is_an_elastica(directions, D):
     clamp = 0.2 / 29  # the second row is held
     L, weight = 0.2 - clamp, 0.15 * 9.81
 
-    def bend(s, y):  # D theta'' = w (L - s) cos(theta), the moment of what hangs beyond s
+    def bend(s, y):  # D theta'' = w (L - s) cos(theta): moment of the strip beyond s
         return np.stack([y[1], -weight * (L - s) * np.cos(y[0]) / D])
 
     s = np.linspace(0, L, 200)
@@ -135,8 +135,8 @@ def test_a_heavy_cantilever_is_an_elastica(directions, D):
     assert -end[-4:, 2].mean() == pytest.approx(abs(drop), rel=0.02)
 
 
-def test_the_end_of_a_long_rollout_is_one():
-    """What sticks there holds; the rollout still creeps there, by .01 mm/s after 6 s."""
+def test_the_end_of_a_long_rollout_is_an_equilibrium():
+    """Sticking contacts hold; the rollout still creeps by .01 mm/s after 6 s."""
     contact = dc.ContactOptions(slip_velocity=1e-5)
     sim = drape(contact=contact)
     with torch.no_grad():
@@ -156,7 +156,7 @@ def test_the_end_of_a_long_rollout_is_one():
     ids=["smooth", "rough"],
 )
 def test_a_disk_on_a_pedestal_drapes_as_a_long_rollout_does(cusick, friction, seconds):
-    """Cusick's test, once the folds have formed; friction is anchored where the rollout ends."""
+    """Cusick's test with formed folds; friction is anchored at the end of the rollout."""
     drape = cusick.make(5e-5, friction, 0.02)
     folded, end = cusick.fall(drape, seconds, 0.5)
     start = end if friction else folded
@@ -177,7 +177,7 @@ def test_a_stiffer_disk_drapes_less(cusick):
     assert coefficients[0] < coefficients[1] < 1.0
 
 
-def test_without_friction_a_rollout_ends_there():
+def test_a_rollout_without_friction_ends_at_the_equilibrium():
     cloth = strip(12, 0.2, 0.03, material=dc.Material(bending=1e-4, damping=0.05))
     pins = {"clamp": range(8)}
     cloth = dc.Cloth(cloth.vertices, cloth.faces, material=cloth.material, pins=pins)
@@ -203,7 +203,7 @@ def test_a_sheet_sticks_on_an_incline_and_holds_its_weight():
     torch.testing.assert_close(
         force, torch.tensor([0, 0, -weight], dtype=F64), rtol=0, atol=1e-6 * weight
     )
-    # Along the slope it stays within what friction yields by.
+    # Motion along the slope is within the yield of regularized friction.
     slope = torch.tensor([np.cos(angle), 0.0, -np.sin(angle)], dtype=F64)
     assert ((found.positions - state.positions) @ slope).abs().max() < 1e-5
 
@@ -234,8 +234,8 @@ def directions(sim, names):
         yield name, value, scale * factor * value
 
 
-# Of differences: rounding of the strip's equilibria hides its stretch at smaller ones, and the
-# friction of the drape is settled anew at larger ones.
+# Steps of the differences: at smaller steps, rounding of the strip's equilibria hides its stretch;
+# at larger steps, the friction of the drape settles anew.
 @pytest.mark.parametrize(
     ("make", "step", "names"),
     [
@@ -252,7 +252,7 @@ def directions(sim, names):
     ids=["cantilever", "drape"],
 )
 def test_gradients_are_those_of_the_equilibrium(make, step, names):
-    """By differences of equilibria that are searched for from the one found, with its friction."""
+    """By differences of equilibria, searched from the equilibrium found, with its friction."""
     sim = make()
     state = sim.initial_state()
     found = sim.equilibrium(state)
@@ -298,7 +298,7 @@ def test_gradients_by_pins_forces_and_the_state():
         leaf = value.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(loss(given | {name: leaf}), leaf)
         way = torch.randn(value.shape, generator=torch.Generator().manual_seed(3), dtype=F64)
-        if name == "positions":  # pins hold where the state has them, all else is forgotten
+        if name == "positions":  # only pins depend on the state: they stay at its positions
             assert gradient[:8].any()
             assert gradient[8:].abs().max() < 1e-6 * gradient[:8].abs().max()
             way[8:] = 0.0
@@ -310,8 +310,10 @@ def test_gradients_by_pins_forces_and_the_state():
 
 
 def pulled_box():
-    """A box on a sheet that its rim holds, pulled over it by a spring; friction is far from settled
-    after the friction iterations of one step."""
+    """A box that a spring pulls over a sheet held at its rim.
+
+    Friction is far from settled after the friction iterations of one step.
+    """
     n = 7
     rim = [i for i in range(n * n) if i // n in (0, n - 1) or i % n in (0, n - 1)]
     cloth = dc.Cloth.grid(n, n, 0.3, pins={"rim": rim}, material=dc.Material(friction=0.8))
@@ -414,7 +416,7 @@ def test_slip_velocities_and_failures_of_others_change_no_bit():
 
 
 def test_environments_of_a_batch_are_those_alone():
-    """Friction settles within two steps in the first, and in eight in the second."""
+    """Friction settles within two steps in the first environment, in eight in the second."""
     sim = drape(rows=7)
     state = sim.initial_state(2)
     parameters = sim.default_parameters()
@@ -429,8 +431,8 @@ def test_environments_of_a_batch_are_those_alone():
         assert torch.equal(batch.body_forces[k], alone.body_forces)
 
 
-def test_what_resists_motion_changes_nothing_at_rest():
-    """Neither the equilibrium nor the way there, which the report tells all of."""
+def test_damping_and_drag_change_nothing_at_rest():
+    """The equilibrium and the search, including all values of the report, are equal."""
     sim = cantilever()
     names, ends = ("damping", "normal_drag", "tangential_drag"), []
     for size in (0.0, 50.0):
@@ -446,7 +448,7 @@ def test_what_resists_motion_changes_nothing_at_rest():
     assert again.report.iterations < found.report.iterations
 
 
-def test_split_finds_the_same_one():
+def test_split_finds_the_same_equilibrium():
     alike = [s.equilibrium(s.initial_state()).positions for s in (drape(), drape("split"))]
     assert torch.equal(*alike)
 
@@ -454,7 +456,7 @@ def test_split_finds_the_same_one():
 @pytest.mark.parametrize("with_cloth", [False, True])
 @pytest.mark.parametrize("degrees", [5, 10, 30, 44, 60, 80])
 def test_a_box_that_is_tilted_comes_to_lie_on_its_table(degrees, with_cloth):
-    """Friction alone holds it along the table, and beyond the rim there is nothing."""
+    """Only friction holds the box along the table, and there is no support beyond the rim."""
     angle = math.radians(degrees)
     height = 0.05 * math.sqrt(2) * math.cos(math.radians(45 - degrees)) + 0.002
     turned = [math.cos(angle / 2), math.sin(angle / 2), 0, 0]
@@ -472,7 +474,7 @@ def test_a_box_that_is_tilted_comes_to_lie_on_its_table(degrees, with_cloth):
     assert 0.05 < float(end[2]) < 0.053
 
 
-def test_the_time_step_of_the_search_is_not_told(monkeypatch):
+def test_messages_omit_the_time_step_of_the_search(monkeypatch):
     def turns(self, *arguments):
         raise dc.TurnedTooFar("step: take a time step of at most 0.06 s", environments=[2])
 
@@ -484,7 +486,7 @@ def test_the_time_step_of_the_search_is_not_told(monkeypatch):
     assert "time step" not in str(raised.value)
 
 
-def test_what_falls_is_named():
+def test_a_falling_object_is_named():
     sheet = dc.Cloth.grid(4, 4, (0.2, 0.2), name="sheet")
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)
     with pytest.raises(dc.SimulationError, match="equilibrium: 'sheet' is free to move"):
@@ -492,7 +494,7 @@ def test_what_falls_is_named():
 
 
 def test_the_environments_in_which_something_falls_are_named():
-    """It falls from a sheet that holds it elsewhere."""
+    """The box falls off a sheet that supports it in other environments."""
     sheet = dc.Cloth.grid(3, 3, (0.2, 0.2), pins={"all": range(9)}, name="sheet")
     box = dc.RigidBody.box(
         0.1, motion="dynamic", mass=0.01, pose=[0, 0, 0.06, 1, 0, 0, 0], name="box"
@@ -505,7 +507,7 @@ def test_the_environments_in_which_something_falls_are_named():
     assert error.value.environments == (1, 3)
 
 
-def test_what_may_slide_is_named():
+def test_a_sheet_that_may_slide_is_named():
     sheet = dc.Cloth.grid(
         4, 4, (0.2, 0.2), pose=[0, 0, 0.002, 1, 0, 0, 0], name="sheet",
         material=dc.Material(friction=0.0),
@@ -518,7 +520,7 @@ def test_what_may_slide_is_named():
 
 @pytest.mark.parametrize("size", [(9, 6), (5, 7), (6, 6), (7, 4), (8, 8), (4, 4), (5, 5), (7, 7)])
 def test_a_sheet_that_hangs_from_one_vertex_turns(size):
-    """It turns about the vertical; residual forces of a solve hold or drive that mode a little."""
+    """The sheet rotates about the vertical; residual forces of a solve affect this mode."""
     cloth = dc.Cloth.grid(*size, 0.2, pins={"a": [0]}, name="flag")
     simulator = dc.Simulator(dc.Scene([cloth]), 0.01)
     with pytest.raises(dc.SimulationError, match="'flag' is free to turn or to change its shape"):
@@ -535,7 +537,7 @@ def test_a_body_that_floats_is_named():
         sim.equilibrium(sim.initial_state())
 
 
-def test_what_has_no_equilibrium_is_refused():
+def test_schemes_without_equilibria_are_refused():
     sim = cantilever()
     box = dc.RigidBody.box(0.1, pose=[0, 0, -1, 1, 0, 0, 0], nodal_contact=True, name="box")
     nodal = dc.Simulator(dc.Scene(sim.scene.cloths, [box]), 0.01, scheme="split")
@@ -556,8 +558,8 @@ def test_too_few_iterations_are_a_failure_or_a_value():
     assert sim.equilibrium(sim.initial_state()).report.status == "not_converged"
 
 
-def test_what_does_not_settle_has_no_gradient(monkeypatch):
-    """With `throw=False` it is a value, and backward says so."""
+def test_an_unsettled_equilibrium_has_no_gradient(monkeypatch):
+    """With `throw=False` the failure is a value, and backward raises."""
     monkeypatch.setattr(equilibrium, "_SETTLED", 0.0)
     monkeypatch.setattr(equilibrium, "_REPEATS", 1)
     silent = dc.SolverOptions(tolerance=1e-12, throw=False)
@@ -571,7 +573,7 @@ def test_what_does_not_settle_has_no_gradient(monkeypatch):
 
 
 def test_a_scene_of_bodies_has_the_scale_of_its_bodies():
-    """In units a thousand times smaller, what falls is found falling as well."""
+    """A falling body is also detected in units a thousand times smaller."""
     for unit in (1.0, 1e-3):
         box = dc.RigidBody.box(
             0.1 * unit, motion="dynamic", mass=0.1, pose=[0, 0, unit, 1, 0, 0, 0], name="box"
@@ -604,7 +606,7 @@ SOFT = {"stretch": 100.0, "stretch_weft": 100.0, "stretch_shear": 10.0, "bending
     ],
 )
 def test_a_search_begins_at_its_state(count, size, material, pins, force):
-    """Where inertia alone leads in its last step is 4e14 m away, and the energy there no number."""
+    """The inertial prediction of the last step is 4e14 m away, with an energy that is NaN."""
     cloth = dc.Cloth.grid(
         count, count, size, pins={"corners": pins}, material=dc.Material(**material)
     )

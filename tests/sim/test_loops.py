@@ -1,4 +1,4 @@
-"""What loops need: contacts by pair, meshes, parts of batches, named parameters, trajectories."""
+"""For loops: contacts by pair, meshes, parts of batches, named parameters, trajectories."""
 
 import numpy as np
 import pytest

@@ -76,7 +76,7 @@ def test_pairs_that_are_not_named_keep_what_the_scene_has(sim):
     assert not torch.equal(slide(sim, {("mat", "floor"): 0.0}).positions, ordinary.positions)
 
 
-def test_each_environment_may_have_its_own(sim):
+def test_environments_may_have_separate_friction(sim):
     values = torch.tensor([0.1, 0.3], dtype=F64, requires_grad=True)
     both = slide(sim, {("mat", "floor"): values, ("mat", "mat"): 0.2}, batch_size=2)
     for i, mu in enumerate((0.1, 0.3)):
@@ -87,16 +87,16 @@ def test_each_environment_may_have_its_own(sim):
     assert values.grad[1] == 0
 
 
-def test_it_prints_and_pickles(sim):
+def test_named_friction_prints_and_pickles(sim):
     parameters = dc.Parameters(friction={("mat", "floor"): number(0.25)})
     assert "friction={('mat', 'floor'): 0.25 (grad)}" in repr(parameters)
     copy = pickle.loads(pickle.dumps(dc.Parameters(friction={("mat", "floor"): 0.25})))
     assert copy.friction == {("mat", "floor"): 0.25}
 
 
-# The box is light, and the warning about it is not what this is about.
+# The box is light; this test does not need the warning about its added mass.
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
-def test_couplings_take_it():
+def test_couplings_accept_named_friction():
     mat = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 0.001, 1, 0, 0, 0], name="mat")
     box = dc.RigidBody.box(
         0.1, motion="dynamic", mass=0.1, pose=[0, 0, 0.053, 1, 0, 0, 0], name="box"
@@ -142,7 +142,7 @@ ACCEPTED = r"must name pairs \(a, b\) of the surfaces 'mat', 'floor', 'far'; got
         pytest.param({("mat", "floor"): None}, TypeError, "real numbers", id="none"),
     ],
 )
-def test_what_is_no_friction_is_refused(sim, friction, error, message):
+def test_values_that_are_no_friction_are_refused(sim, friction, error, message):
     with pytest.raises(error, match=r"^rollout: `parameters\.friction") as caught:
         slide(sim, friction)
     assert re.search(message, str(caught.value))

@@ -1,4 +1,4 @@
-"""Messages name what a user has named: surfaces and pins."""
+"""Messages use the names that a user has given to surfaces and pins."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_pins_on_a_body_are_named_where_all_vertices_are_pinned():
     with pytest.raises(dc.InfeasibleMotion) as caught:
         simulator.step(state, dc.Control(pins=down(state.positions, 0.6)))
     text = str(caught.value)
-    # Only what is in the way: the sheet is tilted, and the table lies under its lower half.
+    # Only the blocking pins: the sheet is tilted, and the table lies under its lower half.
     assert "in contact: cloth 'shirt' (pins 'left'), body 'table';" in text
 
 
@@ -70,7 +70,7 @@ def test_links_are_named():
 
 
 def test_a_motion_that_is_merely_slow_says_so():
-    """A body that turns by a right angle does so in portions, each an iteration."""
+    """A rotation by a right angle is made in portions of one iteration each."""
     box = dc.RigidBody.box(0.2, motion="kinematic")
     simulator = dc.Simulator(
         dc.Scene([sheet(4, 0.5, pins={"all": range(16)})], [box]),
@@ -94,7 +94,7 @@ def test_an_overlap_is_named():
 
 
 @pytest.mark.parametrize("load", [1.0, 1e4])
-def test_what_is_pressed_too_hard_is_named(load):
+def test_surfaces_pressed_too_hard_are_named(load):
     mat = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 0.003, 1, 0, 0, 0], name="mat")
     floor = dc.RigidBody.plane(2.0, name="floor")
     weak = dc.ContactOptions(barrier_stiffness=1e-16, barrier_distance=0.002)
@@ -106,7 +106,7 @@ def test_what_is_pressed_too_hard_is_named(load):
 
 
 def test_a_motion_to_a_gap_of_zero_is_refused():
-    """The way there is never at its end; neither its message nor its report says that it is."""
+    """The motion is never completed; neither the message nor the report claims completion."""
     floor = dc.RigidBody.box([1, 1, 0.1], pose=[0, 0, -0.05, 1, 0, 0, 0])
     lid = dc.RigidBody.box([1, 1, 0.1], pose=[0.01, 0.02, 0.15, 1, 0, 0, 0], motion="kinematic")
     cloth = dc.Cloth.grid(5, 5, size=0.4, pose=[0, 0, 0.05, 1, 0, 0, 0])

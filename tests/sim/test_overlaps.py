@@ -16,7 +16,7 @@ INERTIAL = (
 
 
 def save_tree(folder, positions, size=0.1):
-    """A robot whose links slide along x from one base that has no shape; boxes around x."""
+    """A robot with links that slide along x from a base without shape; boxes at `positions`."""
     parts = ['<robot name="r"><link name="base"/>']
     for i, x in enumerate(positions):
         parts.append(f'<link name="l{i}">{INERTIAL}{BOX.format(size)}</link>')

@@ -1,4 +1,4 @@
-"""Surfaces placed at a state: one answer for meshes, pictures and wrenches, and the right one."""
+"""Surfaces placed at a state: correct, and equal for meshes, pictures and wrenches."""
 
 import numpy as np
 import pytest

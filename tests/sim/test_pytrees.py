@@ -33,7 +33,7 @@ def test_a_state_is_a_tree_of_its_tensors(simulator):
     assert keystr(paths[0][0]) == ".positions"
     again = structure.unflatten(leaves)
     assert isinstance(again, dc.State)
-    assert again.report is None  # it describes a step that has not led to other tensors
+    assert again.report is None  # a report describes one step, which did not yield other tensors
     assert again.meshes().keys() == {"sheet", "ball"}
     assert torch.equal(simulator.step(again).positions, simulator.step(state).positions)
     axes = tree_map(lambda _: None, state)
@@ -73,7 +73,7 @@ def test_a_control_is_a_tree_of_what_it_sets(simulator):
     assert torch.equal(moved.pins["edge"], state.positions[:3] + 0.002)
     found = torch.func.grad(lambda c: simulator.step(state, c).positions.sum())(control)
     assert found.pins["edge"].shape == (3, 3)
-    # Gradients are by each of several fields, as by one.
+    # Gradients are computed by each of several fields.
     assert found.wind.shape == (3,)
 
 

@@ -1,4 +1,4 @@
-"""Numbers so large or small that their powers leave float64 are refused, wherever they enter."""
+"""Numbers whose powers overflow or underflow float64 are refused at every input."""
 
 import dataclasses
 import re
@@ -22,7 +22,7 @@ def sim():
 
 @pytest.fixture(scope="module")
 def moved_sim():
-    """With a body and a robot that forces move: a scene that has every parameter."""
+    """A simulator with every parameter: forces also move a body and a robot."""
     material = dc.fabrics.material("denim")
     cloth = dc.Cloth.grid(3, 3, pins={"a": [0]}, soft_pins={"b": [8]}, material=material)
     box = dc.RigidBody.box(0.2, motion="dynamic", mass=1.0, pose=[0, 0, -0.2, 1, 0, 0, 0])
@@ -111,7 +111,7 @@ def test_a_parameter_that_vanishes_is_refused(sim, field):
         sim.step(sim.initial_state(), None, bad)
 
 
-# The length of each, and what the last four entries say about it.
+# Quaternions, and the text about their length in the error.
 @pytest.mark.parametrize(
     ("quaternion", "text"),
     [
@@ -172,7 +172,7 @@ def test_a_mesh_whose_squares_vanish_is_refused(size):
         dc.Cloth(size * np.array(cloth.vertices), cloth.faces)
 
 
-# What is accepted is followed: forces and velocities move the cloth, or the step says why not.
+# Accepted forces and velocities move the cloth, or the step reports the reason.
 @pytest.mark.parametrize("size", [1e3, 1e6, 1e12, 1e20, 1e29])
 @pytest.mark.parametrize("what", ["velocities", "forces"])
 def test_large_velocities_and_forces_are_followed_or_refused(sim, what, size):

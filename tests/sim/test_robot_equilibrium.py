@@ -70,8 +70,8 @@ def test_an_arm_sags_on_its_drives(arm, stiffness):
     assert not found.joint_velocities.any()
 
 
-def test_what_resists_motion_changes_nothing_at_rest(arm):
-    """Neither the equilibrium nor the way there."""
+def test_damping_and_viscosity_change_nothing_at_rest(arm):
+    """The equilibrium and the search are equal for any viscosity."""
     sim = alone(arm(stiffness=8.0, damping=1.0))
     ends = []
     for size in (0.0, 100.0):
@@ -108,7 +108,7 @@ def test_efforts_of_prescribed_joints_hold_the_weight(arm):
 
 
 def test_a_joint_that_keeps_a_velocity_stays_with_a_gradient(arm):
-    """It rests where the search begins, and carries the other one along."""
+    """The joint stays at the start of the search, and its position determines the other joint."""
     actuation = {"shoulder": "velocity", "elbow": "pd"}
     sim = alone(arm(actuation=actuation, stiffness={"elbow": 2.0}, damping={"elbow": 1.0}))
 
@@ -142,7 +142,7 @@ def onto_a_sheet(arm, **options):
     robot = arm(stiffness=3.0, damping=1.0, pose=[0, 0, 0.3, 1, 0, 0, 0], **options)
     corners = {"corners": [0, 9, 90, 99]}
     sheet = dc.Cloth.grid(10, 10, (0.5, 0.5), pose=[0.35, 0, 0.15, 1, 0, 0, 0], pins=corners)
-    # What slid there is at the edge of its friction: changes of 1e-5 stay within this slip.
+    # Contacts that have slid are at the limit of friction: changes of 1e-5 stay within this slip.
     contact = dc.ContactOptions(slip_velocity=1e-3)
     return dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, contact=contact, solver=TIGHT)
 
@@ -197,8 +197,8 @@ def test_a_batch_of_arms_has_the_bits_of_each(arm):
         assert torch.equal(batch.joint_positions[k], single.joint_positions)
 
 
-def test_a_rollout_ends_there(arm):
-    """At any time step: velocity products of a fall had moved its end by the order of h squared."""
+def test_a_rollout_ends_at_the_equilibrium(arm):
+    """For any time step h; velocity products of a fall once shifted the end by O(h^2)."""
     errors = []
     for dt in (0.02, 0.01):
         robot = arm(stiffness=4.0, damping=0.5)
@@ -291,7 +291,7 @@ def test_a_joint_that_nothing_holds_is_named(arm, viscosity):
 
 
 def test_the_environment_whose_joint_nothing_holds_is_named(arm):
-    """With that joint, though another yields more elsewhere; a damper alone does not hold it."""
+    """The free joint is named although another joint yields more; a damper alone does not hold."""
     sim = alone(arm(stiffness=5.0, damping=1.0), gravity=(0, 9.81, 0))
     gains = torch.tensor([[2.0, 50.0], [50.0, 0.0], [2.0, 50.0], [50.0, 0.0]], dtype=F64)
     parameters = sim.default_parameters().replace(joint_stiffness=gains)
@@ -420,8 +420,8 @@ def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, na
 
 
 @pytest.mark.parametrize("table", [None, -1.0])
-def test_what_a_hand_holds_by_friction_stays_in_it(table):
-    """Long steps must not begin where inertia alone would lead: out of the grip, which closes."""
+def test_an_object_held_by_friction_stays_in_the_hand(table):
+    """Long steps must not begin at the inertial prediction, which is outside the closing grip."""
     hand = dc.Robot.load(
         dc.robots.GRIPPER,
         pose=[0, 0, 0.5, 0, 1, 0, 0],
@@ -447,7 +447,7 @@ def test_what_a_hand_holds_by_friction_stays_in_it(table):
     with torch.no_grad():
         held = simulator.rollout(simulator.initial_state(), [close] * 60)[-1]
         found = simulator.equilibrium(held, close)
-        # Without the grip it would fall by .39 m.
+        # Without the grip the object would fall by .39 m.
         longer = dc.Simulator(scene, 0.2, contact=contact, solver=TIGHT).step(held, close)
     assert (found.body_poses[0] - held.body_poses[0]).abs().max() < 2e-6
     assert (longer.body_poses[0] - held.body_poses[0]).abs().max() < 5e-6
@@ -462,7 +462,7 @@ def test_what_a_hand_holds_by_friction_stays_in_it(table):
     "actuation", [("pd", "position"), ("position", "pd"), ("position", "position")]
 )
 def test_efforts_of_an_arm_that_hangs_follow_its_targets(arm, actuation):
-    """A floating base, which nothing but springs holds: its rows of momentum say nothing there."""
+    """Only springs hold the floating base: its momentum rows do not determine efforts."""
     points = [
         [0.02, 0.015, 0.015],
         [0.28, 0.015, -0.015],

@@ -1,6 +1,6 @@
-"""What may go wrong around a step: bad scenes and states, threads, workers, interrupts, memory.
+"""Failures around a step: bad scenes and states, threads, workers, interrupts, memory.
 
-Bad values of single arguments are in the tests of meshes, scenes and the contract.
+Tests of meshes, scenes and the contract cover bad values of single arguments.
 """
 
 import os
@@ -24,7 +24,7 @@ DT = 0.01
 
 
 def tent(cells=6, **keywords):
-    """A sheet a little above a ball that it touches within a few steps; generic coordinates."""
+    """A sheet slightly above a ball, in contact within a few steps; generic coordinates."""
     cloth = dc.Cloth.grid(
         cells,
         cells,

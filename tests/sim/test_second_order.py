@@ -1,4 +1,4 @@
-"""The step of second order: momentum, order, drag, rest, bits, and what is refused."""
+"""The step of second order: momentum, order, drag, rest, bits and refused options."""
 
 from dataclasses import replace
 
@@ -90,13 +90,13 @@ def test_errors_fall_with_the_square_of_the_time_step():
     assert errors[0.0025, "implicit_euler"] > 0.4 * errors[0.005, "implicit_euler"]
 
 
-def test_what_rests_stays_as_by_euler():
+def test_a_sheet_at_rest_stays_as_by_euler():
     """Without velocities there is no shift: both integrators minimize the same sum."""
     case = scenes.regime("sticking")
     rest = case.state.replace(velocities=torch.zeros_like(case.state.velocities))
     second = scenes.regime("sticking", integrator=SECOND)
     still = case.where(state=rest), second.where(state=rest)
-    # Drag is that of another mean velocity.
+    # Without air, because drag depends on the integrator's mean velocity.
     parameters = {"air_density": torch.zeros((), dtype=F64)}
     ends = [replace(c, parameters=parameters).step().positions for c in still]
     torch.testing.assert_close(*ends, rtol=0, atol=1e-9)
@@ -152,7 +152,7 @@ def test_the_conversion_needs_a_simulator_of_second_order():
         dc.at_half_step(euler.initial_state(), simulator=euler)
 
 
-def test_what_is_not_supported_is_refused_by_name():
+def test_unsupported_options_are_refused_by_name():
     scene = dc.Scene([sheet()])
     with pytest.raises(dc.InvalidInput, match=r"`integrator` 'second_order' needs scheme"):
         dc.Simulator(scene, 0.01, scheme="split", integrator=SECOND)

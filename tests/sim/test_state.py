@@ -47,7 +47,7 @@ TENSORS = tuple(STATE)
 
 
 @pytest.mark.parametrize("batch", [(), (4,)])
-def test_what_is_left_out_becomes_rows_of_zeros(batch):
+def test_omitted_fields_become_rows_of_zeros(batch):
     """The fields that the first version has, by position and by name."""
     full = make(batch=batch)
     first = [getattr(full, name) for name in TENSORS[:6]]

@@ -1,4 +1,4 @@
-"""Rest meshes whose parts touch, as files often have them."""
+"""Rest meshes with touching parts, which are frequent in files."""
 
 import numpy as np
 import pytest

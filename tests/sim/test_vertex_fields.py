@@ -66,7 +66,7 @@ def test_unclear_shapes_are_refused(simulator):
         simulator.step(simulator.initial_state(), None, dc.Parameters(density=values * 0))
 
 
-def test_as_many_vertices_as_faces_are_refused_and_names_are_clear():
+def test_equal_counts_of_vertices_and_faces_are_refused_and_names_are_clear():
     """A sheet of 3 x 4 vertices has 12 faces."""
     material = dc.Material(density=torch.linspace(0.1, 0.2, 12))
     sheet = dc.Cloth.grid((4, 3), 0.3, name="sheet", material=material)

@@ -1,7 +1,7 @@
-"""One input, one output: starts that differ by next to nothing end in the same minimum.
+"""Continuity of a step: starts with tiny differences end in the same minimum.
 
-Where a sheet that is thrown on a sphere buckles, a step has several. Each of these scenes has
-states from which half of the starts ended elsewhere. One in twenty still may.
+A step of a sheet that buckles on a sphere has several minima. Each of these scenes has states from
+which half of the starts once ended in another minimum; one in twenty still may.
 """
 
 import importlib

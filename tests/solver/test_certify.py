@@ -13,7 +13,7 @@ REGIMES = ["stacked", "sphere", "folded", "sticking", "sliding"]
 
 
 def simulators(name, tolerance):
-    """The simulator of a regime, once for each option, and the inputs of its step."""
+    """The case of a regime, and its simulator with each option of `certify`."""
     case = scenes.regime(name)
     sim = case.sim
     solver = replace(sim.solver, tolerance=tolerance)
@@ -107,7 +107,7 @@ def gradients_by(sim, case):
 @pytest.mark.parametrize("name", REGIMES)
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-4])
 def test_gradients_are_those_of_the_solution(name, tolerance):
-    """Backward refines what forward has left: a looser tolerance changes gradients by lag alone."""
+    """Backward refines the forward solution: a looser tolerance changes only lagged friction."""
     case, sims = simulators(name, tolerance)
     _, exact = simulators(name, 1e-10)
     reference, _ = gradients_by(exact["always"], case)

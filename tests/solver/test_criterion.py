@@ -23,9 +23,9 @@ def simulator(scheme="coupled", elastic="newton", **options):
 
 
 def pushed_batch():
-    """Three environments; the pins of the second go through the plane, and the third is torn.
+    """Three environments: the second's pins move through the plane, the third is torn apart.
 
-    The second is stuck after 40 iterations; the third does not converge in 500 either.
+    The second is blocked after 40 iterations; the third does not converge in 500 either.
     """
     sim = simulator(max_iterations=60)
     start = sim.initial_state(batch_size=3)
@@ -64,7 +64,7 @@ def test_a_limit_of_a_step_is_its_criterion(scheme, options, criterion):
     assert report.criterion == criterion
 
 
-def test_each_environment_of_a_batch_has_its_own():
+def test_environments_of_a_batch_have_separate_criteria():
     sim, start, control = pushed_batch()
     report = sim.step(start, control).report
     assert report.status == ("converged", "infeasible_motion", "not_converged")
@@ -81,7 +81,7 @@ def test_a_start_that_intersects_is_not_solved():
     assert caught.value.report.criterion == "no_solve"
 
 
-def test_it_is_selected_stacked_chosen_and_saved(tmp_path):
+def test_the_criterion_is_selected_stacked_chosen_and_saved(tmp_path):
     sim, start, control = pushed_batch()
     state = sim.step(start, control)
     report = state.report

@@ -1,4 +1,4 @@
-"""A stiff sheet that turns far in one step: a long way through a narrow, curved valley."""
+"""A stiff sheet that rotates far in one step: a long path in a narrow, curved valley."""
 
 import numpy as np
 import pytest

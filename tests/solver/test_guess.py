@@ -1,4 +1,4 @@
-"""A step begins where inertia alone would go, unless that way or its end is not free of contact."""
+"""A step begins at the inertial prediction, unless the path to it or its end has contact."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ D_HAT = 2e-3
 
 
 def falling(gap, speed):
-    """A sheet that falls onto a floor: its path, and where inertia alone would take it."""
+    """A sheet that falls onto a floor: the path of its step and its inertial prediction."""
     sheet = dc.Cloth.grid(5, 5, size=0.2, pose=[0, 0, gap, 1, 0, 0, 0])
     floor = dc.RigidBody.plane(1.0)
     contact = dc.ContactOptions(barrier_distance=D_HAT)
@@ -33,7 +33,7 @@ def test_a_free_way_is_taken_at_once():
 
 
 def test_a_guess_in_contact_is_not_taken():
-    # It ends within the barrier's reach: so near a surface a solve would begin at its steepest.
+    # The guess is within the barrier's reach, where a solve would begin at its steepest point.
     path, predicted = falling(gap=0.01, speed=0.9)  # ends 1 mm above the floor
     assert not visits(path, predicted)
 
@@ -45,11 +45,11 @@ def test_a_guess_behind_a_surface_is_not_taken():
 
 
 def flights(*, height=0.3, speed=0.0, turn=0.0, attached=False):
-    """A cube that flies beside a sheet in contact: how far it has come at each point of the path.
+    """A cube that flies beside a sheet in contact: its progress along the path of the step.
 
     Returns:
-        Of all of its free motion, at the points of the path after the start; of its vertices the
-        least.
+        Share of its free motion at each point of the path after the start; minimum over its
+        vertices.
     """
     floor = dc.RigidBody.plane(4.0)
     pose = [1.0, 0, height, 1, 0, 0, 0]
@@ -78,9 +78,9 @@ def test_a_free_body_that_meets_nothing_flies_at_once():
     assert (flights(turn=0.5) - 1).abs().max() < 1e-12
 
 
-def test_a_free_body_that_would_end_behind_a_surface_does_not():
+def test_a_free_body_that_would_end_behind_a_surface_does_not_fly_at_once():
     assert flights(height=0.05 + 0.01, speed=3.0)[0] < 0.99
 
 
-def test_a_body_on_a_spring_does_not():
+def test_a_body_on_a_spring_does_not_fly_at_once():
     assert flights(attached=True)[0] < 0.99

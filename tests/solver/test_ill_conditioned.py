@@ -1,4 +1,4 @@
-"""Scenes in which single precision does not do: factors in doubles take its place, unasked."""
+"""Scenes beyond single precision: the solver falls back to factors in double precision."""
 
 import pytest
 import torch
@@ -33,7 +33,7 @@ def strip(load):
 
 
 def net(n, *, stretch):
-    """A sheet in no plane of the coordinates, stiff against all but what its mass resists."""
+    """A sheet in general orientation, stiff in its plane and with little inertia."""
     pose = [0, 0, 0, 0.9, 0.3, 0.1, 0.3]
     cloth = dc.Cloth.grid(
         n, n, pose=pose, material=dc.Material(stretch=stretch), pins={"corners": [0, n - 1]}
@@ -42,7 +42,7 @@ def net(n, *, stretch):
 
 
 SCENES = {
-    # A pivot is negative by rounding, and by much.
+    # A pivot is clearly negative, due to rounding.
     "slivers": lambda: slivers(200),
     # A pivot is too small.
     "stiff": lambda: net(16, stretch=1e6),
@@ -68,7 +68,7 @@ def test_cloth_takes_hardly_any():
     state = simulator.initial_state()
     for _ in range(3):
         state = simulator.step(state)
-        assert state.report.counts["in_doubles"] <= 1  # whether the first was right
+        assert state.report.counts["in_doubles"] <= 1  # at most one check of the first factor
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_differences(name):
     loss(velocities).backward()
     direction = torch.randn(start.shape, generator=torch.Generator().manual_seed(3)).double()
     with torch.no_grad():
-        # The stiff net buckles after more.
+        # The stiff net buckles after larger changes.
         size = 1e-5 if name == "stiff" else 1e-3
         expected = difference(lambda v: loss(v).item(), start, direction, size)
     found = (velocities.grad * direction).sum().item()
@@ -93,7 +93,7 @@ def test_gradients_are_those_of_differences(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_factors_that_are_made_again_are_the_same(name):
-    """In whatever precision they are."""
+    """Remade factors are equal in either precision."""
     simulator = SCENES[name]()
     gradients = []
     for forgets in (False, True):
@@ -108,10 +108,10 @@ def test_factors_that_are_made_again_are_the_same(name):
 
 @pytest.mark.parametrize(("load", "is_flat"), [(9.0, True), (9.108, False)])
 def test_a_flat_strip_past_its_critical_load_leaves_its_plane(load, is_flat):
-    """By symmetry nothing pushes it out, and what holds it there is lost in single precision.
+    """By symmetry no force points out of the plane; single precision loses its stiffness.
 
-    Between 9.098 and 9.0995 m/s^2 a factorization of the Hessian in doubles turns. Where the strip
-    ends is far away, with many iterations on the way.
+    Between 9.098 and 9.0995 m/s^2 a factorization of the Hessian in doubles becomes indefinite.
+    The buckled minimum is far away, many iterations later.
     """
     simulator = strip(load)
     after = step(simulator, simulator.initial_state().velocities)

@@ -1,4 +1,4 @@
-"""Kinks of friction: at a small slip velocity its energy is as good as |w|."""
+"""Kinks of friction: at a small slip velocity its energy is nearly |w|."""
 
 import importlib
 from pathlib import Path
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.rounding
 # Four starts within 1e-9 m, with AVX-512 and portable instructions, take 29 or 30, and 32 or 33.
 @pytest.mark.parametrize(("name", "most"), [("crumple", 35), ("twist", 45)])
 def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
-    """Newton's method has no curvature along a slip on either side: up to 52 and 66 iterations."""
+    """Without duals, Newton has no curvature along a slip: up to 52 and 66 iterations."""
     monkeypatch.syspath_prepend(ROOT)
     scenes = importlib.import_module("benchmarks.scenes")
     scene = scenes.BUCKLING[name](12)
@@ -30,8 +30,8 @@ def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
 
 # Three starts within 1e-9 m, with AVX-512 and portable instructions, take 107 and 89.
 @pytest.mark.parametrize(("name", "most"), [("two-sheets", 115), ("self-contact", 100)])
-def test_what_slides_is_expected_to_slide_on(monkeypatch, name, most):
-    """Factorizations of eight steps: 128 and 116 if each step began as if all contacts stuck."""
+def test_sliding_contacts_are_expected_to_slide_on(monkeypatch, name, most):
+    """Factorizations of eight steps; 128 and 116 if each step assumed sticking at its start."""
     monkeypatch.syspath_prepend(ROOT)
     scenes = importlib.import_module("benchmarks.scenes")
     scene = scenes.SCENES[name](12)

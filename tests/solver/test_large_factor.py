@@ -1,4 +1,4 @@
-"""Large factors are dropped before the next one is made, dear ones used for longer: same minima."""
+"""Large factors are dropped before the next one, expensive factors reused: equal minima."""
 
 from functools import partial
 
@@ -35,13 +35,13 @@ def states(scheme):
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
-def test_it_finds_the_same_minimum(scheme, monkeypatch):
+def test_dropped_factors_find_the_same_minimum(scheme, monkeypatch):
     kept = states(scheme)
     monkeypatch.setattr(cores._core, "Simulator", partial(cores._core.Simulator, large_factor=0))
     dropped = states(scheme)
     for a, b in zip(kept, dropped, strict=True):
         torch.testing.assert_close(a.positions, b.positions, rtol=0.0, atol=1e-5)
-    assert any(s.report.counts["negative_curvature"] for s in dropped)  # none of them near
+    assert any(s.report.counts["negative_curvature"] for s in dropped)  # no factor is reused there
 
 
 def swing():
@@ -57,12 +57,12 @@ def swing():
     return result
 
 
-def test_a_dear_factor_is_used_for_longer(monkeypatch):
+def test_an_expensive_factor_is_used_for_longer(monkeypatch):
     cheap = swing()
     monkeypatch.setattr(cores._core, "Simulator", partial(cores._core.Simulator, dear_factor=0.0))
     dear = swing()
     for a, b in zip(cheap, dear, strict=True):
-        # Each is right to the tolerance of 1e-6 m/s; seen: 2e-9.
+        # Each is accurate to the tolerance of 1e-6 m/s; measured difference 2e-9.
         torch.testing.assert_close(a.positions, b.positions, rtol=0.0, atol=2e-8)
     made = [sum(s.report.counts["factorizations"] for s in states) for states in (cheap, dear)]
     assert made[1] < 0.85 * made[0]  # 32 instead of 43

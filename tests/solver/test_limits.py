@@ -1,4 +1,4 @@
-"""How a step ends: the limit on iterations, the tolerance, and a motion that is blocked."""
+"""Ends of a step: the limit on iterations, the tolerance, and a blocked motion."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_a_step_that_is_cut_short_has_a_residual_above_the_tolerance(limit):
 
 
 def test_a_blocked_motion_lets_the_cloth_give_way_before_it_goes_on():
-    # Gaps that a blocked motion has closed would let each further step advance by next to nothing.
+    # With gaps closed by a blocked motion, each further step would advance by nearly nothing.
     sim, state, control = pushed()
     path = sim.path(state, control).numpy()
     cloth, body = path[:, :64], path[:, 64:]
@@ -78,7 +78,7 @@ def test_a_looser_tolerance_converges_where_a_tighter_one_does(tolerance):
 
 
 def test_a_sheet_that_whips_converges_by_default():
-    """Single steps of it take more than 200 iterations, the limit of earlier versions."""
+    """Single steps of this sheet need more than 200 iterations, the limit of earlier versions."""
     n, h = 12, 1 / 60
     grid = dc.Cloth.grid(n, n, size=0.5)
     vertices = np.array(grid.vertices)

@@ -1,7 +1,7 @@
 """A converged step is a minimum: the whole spectrum of its Hessian, by dense eigenvalues.
 
-Every scene starts exactly flat, in its own plane, where the compressed sheet has nothing that tells
-it to which side to buckle: a step may converge towards the saddle, and must not stop in it.
+Every scene starts exactly planar. By symmetry a compressed planar sheet has no preferred side to
+buckle: a step may converge towards the saddle, but must not stop there.
 """
 
 from dataclasses import dataclass, field
@@ -49,7 +49,7 @@ class Sheet:
         return dc.Simulator(scene, self.h, scheme=scheme, contact=contact)
 
     def smallest_eigenvalue(self, positions):
-        """Of M/h^2 + W'' at the free vertices, relative to the mean of M/h^2."""
+        """Smallest eigenvalue of M/h^2 + W'' at free vertices, relative to the mean of M/h^2."""
         X = np.ascontiguousarray(self.cloth.vertices)
         faces = np.ascontiguousarray(self.cloth.faces, dtype=np.int32)
         one = np.ones(len(faces))
@@ -85,7 +85,7 @@ def out_of_plane(state):
     return state.positions[:, 2].abs().max()
 
 
-# Hung in its plane by two corners, and standing on them: in the plane both are saddles.
+# Hung in its plane by two corners, and standing on two corners: planar solutions are saddles.
 @pytest.mark.parametrize("pins", [[90, 99], [0, 9]], ids=["hung", "standing"])
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_a_flat_sheet_never_stops_in_a_saddle(pins, scheme):
@@ -93,8 +93,8 @@ def test_a_flat_sheet_never_stops_in_a_saddle(pins, scheme):
     assert out_of_plane(sheet.check(scheme)) > 1e-4
 
 
-# A stiff sheet crosses its buckling load within so short a way that a factor made before it looks
-# as if it were near.
+# A stiff sheet crosses its buckling load within so short a path that a factor from before the load
+# appears to be current.
 @pytest.mark.parametrize("stretch", [2e4, 1e5])
 @pytest.mark.parametrize("columns", [9, pytest.param(41, marks=pytest.mark.slow)])
 def test_a_stiff_sheet_that_stands_upright_buckles(stretch, columns):
@@ -103,8 +103,8 @@ def test_a_stiff_sheet_that_stands_upright_buckles(stretch, columns):
     assert out_of_plane(sheet.check()) > 1e-6
 
 
-# A column clamped at its foot buckles under its own weight w per length where w L^3 / D > 7.84. The
-# step is long, so that inertia does not hold it.
+# A column clamped at its foot buckles under its own weight w per length if w L^3 / D > 7.84. The
+# step is long, so that inertia does not stabilize the column.
 @pytest.mark.parametrize("load", [12.0, 40.0])
 @pytest.mark.parametrize("dt", [0.05, 1.0])
 def test_a_heavy_column_buckles_once_inertia_lets_it(load, dt):
@@ -117,9 +117,9 @@ def test_a_heavy_column_buckles_once_inertia_lets_it(load, dt):
         assert out_of_plane(state) > 1e-2 * length
 
 
-# Pushed sideways in its plane by this load [m/s^2]. It buckles from 9.0698 on; within the default
-# tolerance it may end a little earlier on the way there, so that 9.0699 is flat, too. Curvature is
-# 1e-10 of the diagonal: far below what single precision sees.
+# A strip with this sideways load in its plane [m/s^2] buckles from 9.0698 on; within the default
+# tolerance a step may end slightly earlier, so that 9.0699 is flat, too. The curvature is 1e-10 of
+# the diagonal: far below the resolution of single precision.
 @pytest.mark.parametrize("load", [9.0692, 9.0697, 9.0702, 9.0707, 9.0717, 9.0727, 9.0737])
 def test_a_strip_about_to_buckle_is_flat_only_where_that_is_a_minimum(load):
     material = dc.Material(stretch=6247.0, bending=7.45e-3)

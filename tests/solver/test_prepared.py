@@ -1,4 +1,4 @@
-"""What a simulator keeps of elastic models from one step to the next."""
+"""Elastic models that a simulator caches from one step to the next."""
 
 import numpy as np
 import pytest

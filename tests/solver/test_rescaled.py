@@ -1,8 +1,8 @@
-"""The same scene in other units takes the same iterations to the same place.
+"""A scene in other units needs the same iterations and ends at the same positions.
 
-No length, time, mass or speed of its own may decide anything in a solve. Powers of two scale every
-number without rounding (of four the masses, as roots are taken of them), so that nothing at all may
-differ; powers of ten round.
+A solve must not depend on any built-in length, time, mass or speed. Powers of two scale every
+number without rounding (for masses powers of four, because of square roots), so that every bit must
+be equal; powers of ten round.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ F64 = torch.float64
 
 @dataclass(frozen=True)
 class Units:
-    """How many of the scene's units of length, mass and time a meter, kilogram and second are."""
+    """One meter, kilogram and second, each in the scene's units."""
 
     m: float = 1.0
     kg: float = 1.0
@@ -129,7 +129,7 @@ def on_a_sphere(u):
 
 
 def buckling(u):
-    """A stiff sheet that stands upright on its lowest rows, flat but for its mesh."""
+    """A stiff sheet that stands upright on its lowest rows, planar up to noise of 1e-6 m."""
     vertices, faces = sheet(16, 6, 0.0125)
     vertices = vertices[:, [0, 2, 1]]
     vertices[:, 1] += 1e-6 * np.random.default_rng(1).uniform(-1, 1, len(vertices))
@@ -178,7 +178,7 @@ def run(name, u):
         frames.append(state.positions.detach() / u.m)
         iterations.append(state.report.iterations)
         assert state.report.converged
-    # Of meters in meters per second.
+    # The loss is in meters; its gradient by velocities has the unit of seconds.
     weights = torch.linspace(-1, 1, state.positions.numel(), dtype=F64).reshape(-1, 3)
     (weights * state.positions).sum().backward()
     return Run(
@@ -219,16 +219,16 @@ def test_a_scene_in_units_of_powers_of_two_has_the_same_bits(name, units):
     assert torch.equal(result.gradient, expected.gradient)
 
 
-# A sheet that buckles takes another way, or to another minimum, after any rounding.
+# Any rounding may change the path or the minimum of a buckling sheet.
 @pytest.mark.rounding
 @pytest.mark.parametrize("units", ROUNDED, ids=label)
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "buckling"])
 def test_a_scene_in_units_of_powers_of_ten_behaves_the_same(name, units):
     expected, result = run(name, Units()), run(name, units)
-    # Rounding may turn a decision of the line search, where one more iteration makes up for it.
+    # Rounding may change a decision of the line search, which one more iteration compensates.
     expected_sum = sum(expected.iterations)
     assert abs(sum(result.iterations) - expected_sum) <= 0.1 * expected_sum
-    # Solves end within 1e-6 m/s of the minimum, mostly far within.
+    # Solves end within 1e-6 m/s of the minimum, mostly much closer.
     assert (result.positions - expected.positions).abs().max() < 1e-8
     assert (result.velocities - expected.velocities).abs().max() < 1e-6
     scale = expected.gradient.abs().max()
@@ -236,7 +236,7 @@ def test_a_scene_in_units_of_powers_of_ten_behaves_the_same(name, units):
 
 
 def strip_on_a_cylinder(u, stretch):
-    """A strip that is held at one end and falls over a cylinder, where it crumples."""
+    """A strip held at one end falls over a cylinder and crumples."""
     rows, cells, radius = 5, 40, 0.05
     grid = dc.Cloth.grid(cells + 1, rows, size=(0.04, 0.4))
     vertices = np.array(grid.vertices)
@@ -255,7 +255,7 @@ def test_a_strip_falls_over_a_cylinder_in_any_unit(units, stretch):
     state = sim.initial_state()
     touched = 0
     for _ in range(40):
-        state = sim.step(state)  # raises where it does not converge
+        state = sim.step(state)  # raises if the step does not converge
         touched = max(touched, state.report.contact_count)
     assert touched > 10
 

@@ -1,4 +1,4 @@
-"""What a step says about its time, and what it leaves in memory."""
+"""Reported times of a step, and its memory."""
 
 import platform
 import sys
@@ -27,8 +27,8 @@ def test_the_seconds_of_a_report_are_those_of_the_step():
             told = sum(state.report.seconds.values())
             assert told <= wall
             untold.append((wall - told) / wall)
-    # The rest is what Python does around the core: about 1.5 of 50 ms and more.
-    # The best step is free of whatever else the machine had to do.
+    # The rest is Python around the core: about 1.5 of 50 ms and more.
+    # The minimum over steps excludes other load of the machine.
     assert min(untold) < 0.06, untold
 
 
@@ -61,7 +61,7 @@ def _lends_huge_pages() -> bool:
 @pytest.mark.slow
 @pytest.mark.skipif(not _lends_huge_pages(), reason="asks the system for huge pages")
 def test_large_arrays_are_asked_of_the_system_in_huge_pages():
-    # 1,000; with pages of 4 KiB 28,000, of which each matrix takes 2,600.
+    # 1,000 faults; 28,000 with pages of 4 KiB, of which each matrix has 2,600.
     assert float(run_python(LARGE_ARRAYS, cwd=ROOT)) < 8000
 
 
@@ -95,11 +95,11 @@ SELF_CONTACT = """
 @pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc to give memory back")
 def test_contacts_that_come_and_go_leave_little_in_memory():
-    # Each new set of contacts is a new pattern of the matrix, whose analysis may be kept.
+    # Each new set of contacts is a new matrix pattern, whose analysis may be kept.
     assert float(run_python(SELF_CONTACT, cwd=ROOT)) < 60  # [MB]
 
 
-# The peak of this process alone: `ru_maxrss` goes on from that of the process that started it.
+# The peak of this process alone: `ru_maxrss` would include the peak of the parent process.
 LARGE_SHEET = """
     import re
     from pathlib import Path

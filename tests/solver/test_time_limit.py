@@ -1,4 +1,4 @@
-"""The limit of time of a step: a status like the others, and no other bit of what ends in time."""
+"""The time limit of a step: a status like others; steps that end in time have equal bits."""
 
 import time
 
@@ -14,7 +14,7 @@ NO_TIME = 1e-9  # [s] over before the first iteration
 
 
 def falling(n=5, schemes=None, **solver):
-    """A sheet that falls onto a box whose edge stays within it."""
+    """A sheet that falls onto a box and overhangs its edges."""
     sheet = dc.Cloth.grid(n, n, 0.2, pose=[0, 0, 0.06, 1, 0.03, 0, 0])
     box = dc.RigidBody.box(0.1)
     options = schemes or {}
@@ -94,7 +94,7 @@ def test_a_motion_without_time_ends_where_everything_prescribed_has_its_place():
 
 @pytest.mark.parametrize("seconds", [0.002, 0.005, 0.01, 0.02, 0.05])
 def test_a_motion_that_is_cut_short_anywhere_ends_at_a_fraction_of_it(seconds):
-    """Where the clock cuts depends on the machine; what must hold there does not."""
+    """The point of interruption depends on the machine; these properties hold at any point."""
     sim, state, control = pushed(max_seconds=seconds, throw=False)
     after = sim.step(state, control)
     fraction = after.report.motion_fraction
@@ -104,7 +104,7 @@ def test_a_motion_that_is_cut_short_anywhere_ends_at_a_fraction_of_it(seconds):
     pose[1] += 0.12 * fraction
     pose[3:] = torch.tensor([np.cos(turn), 0.0, 0.0, np.sin(turn)], dtype=F64)
     torch.testing.assert_close(after.body_poses[0], pose, rtol=0, atol=1e-12)
-    # The start of another step refuses what overlaps.
+    # The start of another step refuses overlaps.
     again = dc.Simulator(sim.scene, sim.dt, solver=dc.SolverOptions(throw=False))
     assert again.step(after).report.converged
 
@@ -130,7 +130,7 @@ def test_an_environment_whose_time_is_up_changes_no_bit_of_the_others():
 
 
 def swarm(count, speed, **solver):
-    """Small sheets in a cube, each of which flies its own way through all others."""
+    """Small sheets in a cube; each flies in its own direction through all others."""
     places = np.stack(np.meshgrid(*[np.arange(count)] * 3), axis=-1).reshape(-1, 3)
     cloths = [dc.Cloth.grid(2, 2, 0.05, pose=[*(0.1 * p), 1, 0, 0, 0]) for p in places]
     sim = dc.Simulator(dc.Scene(cloths), 0.01, solver=dc.SolverOptions(throw=False, **solver))
@@ -139,8 +139,8 @@ def swarm(count, speed, **solver):
     return sim, state.replace(velocities=speed * torch.from_numpy(noise.reshape(-1, 3)))
 
 
-def test_time_is_looked_at_within_detection():
-    """One search and one look at all pairs take seconds; the end takes a look at what is near."""
+def test_time_is_checked_within_collision_detection():
+    """One search and one check of all pairs need seconds; the end checks only near pairs."""
     spent = []
     for limit in (None, 0.1):
         sim, state = swarm(9, 1e4, max_seconds=limit, max_iterations=3)
@@ -151,8 +151,8 @@ def test_time_is_looked_at_within_detection():
     assert spent[1] < 0.5 * spent[0]
 
 
-def test_a_free_body_does_not_look_through_torn_sheets():
-    """What it may meet was looked for along the way of everything: .5 s for 192 vertices."""
+def test_a_free_body_is_not_searched_along_torn_sheets():
+    """An earlier version searched its contacts along the motion of all surfaces: .5 s."""
     ball = dc.RigidBody.sphere(0.05, motion="dynamic", mass=0.1, pose=[0, 0, 0.9, 1, 0, 0, 0])
     sim, state = torn(12, 1e5, [ball], throw=False, max_iterations=2)
     calm = sim.step(state.replace(velocities=1e-5 * state.velocities)).report
@@ -160,13 +160,13 @@ def test_a_free_body_does_not_look_through_torn_sheets():
 
 
 def test_a_torn_sheet_is_followed_in_parts():
-    """Each iteration looked at all pairs, past which it would go if nothing were in its way."""
+    """An earlier version checked in each iteration all pairs along the full step."""
     sim, state = torn(16, 5e3, throw=False, max_iterations=10)
     report = sim.step(state).report
     assert report.iterations == 10
     calm = sim.step(state.replace(velocities=1e-3 * state.velocities)).report
     per_iteration = report.cpu_seconds / report.iterations
-    # It took .3 s an iteration, 60 times as long as one of a calm step.
+    # An iteration once needed .3 s, 60 times the iteration of a calm step.
     assert per_iteration < 15 * calm.cpu_seconds / calm.iterations
 
 

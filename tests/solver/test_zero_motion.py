@@ -1,9 +1,9 @@
-"""A prescribed quantity that is exactly zero and one that is nearly zero lead to the same end.
+"""Prescribed motions of exactly zero and of nearly zero have the same result.
 
-Plans that begin at zero, and policies whose last layer is zero, start where nothing moves. If the
-solver took another path for a motion of exactly zero than for a small one, the gradient would not
-describe `(loss(e) - loss(0)) / e`. The scenes buckle, so that another path ends in another minimum,
-millimeters away.
+Plans that begin at zero, and policies whose last layer is zero, start without motion. If the solver
+used another path for a motion of exactly zero than for a small motion, the gradient would not match
+`(loss(e) - loss(0)) / e`. The scenes buckle: another path ends in another minimum, millimeters
+away.
 """
 
 from functools import cache
@@ -20,12 +20,12 @@ F64 = torch.float64
 DT = 0.01
 SMALL = 1e-11  # [m], [rad], [m/s] or [-]
 STEPS = 12
-# Positions change by less than a hundred times a change of what is prescribed, in all scenes here.
+# In these scenes positions change by less than a hundred times the change of a prescribed value.
 CLOSE = 100 * SMALL
 
 
 def rock(radius, height, jitter, seed):
-    """Vertices of a jittered ellipsoid on its center, and faces."""
+    """Vertices of a jittered ellipsoid about its center, and faces."""
     ball = dc.RigidBody.sphere(radius)
     vertices = np.array(ball.vertices)
     vertices[:, 2] *= height
@@ -69,7 +69,7 @@ def simulator(scheme, coupling):
         name="hand",
     )
     bodies = [body]
-    if (scheme, coupling) != ("split", "monolithic"):  # it takes no dynamic bodies
+    if (scheme, coupling) != ("split", "monolithic"):  # the scheme supports no dynamic bodies
         pose = [-0.15, 0.1, 0.1, 1, 0, 0, 0]
         box = dc.RigidBody.box([0.05, 0.06, 0.04], motion="dynamic", mass=0.2, pose=pose)
         bodies.append(box)
@@ -113,7 +113,7 @@ def along(like, seed):
 
 
 def prescribed(name, sim, state, moved):
-    """The control that holds everything; the quantity `name` is off by next to nothing if moved."""
+    """A control that holds all positions; if `moved`, the quantity `name` is slightly changed."""
     target = torch.tensor([[-0.21, 0.22, 0.22]], dtype=F64)
     fields = {
         "pins": state.positions[[0]],
@@ -160,7 +160,7 @@ CASES = [
     for way in WAYS
     for quantity in QUANTITIES
     if way[0] != "projective"
-    or quantity not in ("base_poses", "joint_positions")  # takes no robots
+    or quantity not in ("base_poses", "joint_positions")  # the scheme supports no robots
 ]
 
 

@@ -1,4 +1,4 @@
-"""What acts in tasks: pins, bodies, robots and forces; gradients of all actions."""
+"""Actions of tasks on pins, bodies, robots and forces; gradients of all actions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_gradients_of_all_actions_are_those_of_finite_differences(short, rng):
         difference = (losses[0] - losses[1]) / 2e-4
         slope = (tensor.grad * direction).sum().item()
         assert difference != 0, name
-        # Losses are known to 2e-14 or so, their differences over 2e-4 to 1e-10.
+        # Losses are accurate to about 2e-14, their differences over 2e-4 to 1e-10.
         assert slope == pytest.approx(difference, rel=1e-4, abs=1e-10), name
 
 

@@ -29,7 +29,7 @@ def test_the_meshes_of_the_configurations_are_what_their_script_makes():
 
 
 def test_own_meshes_are_draped_by_a_plain_clone(tmp_path):
-    """The configurations alone, with nothing beside them: a bell over a skittle that stands."""
+    """A copy of only the configurations: a bell-shaped cloth over a standing skittle."""
     shutil.copytree(CONFIGS, tmp_path / "configs")
     task = load_task(tmp_path / "configs/drape_own.yaml", ["simulation.steps=24"])
     bell, (skittle, _) = task.scene.cloths[0], task.scene.bodies
@@ -37,7 +37,7 @@ def test_own_meshes_are_draped_by_a_plain_clone(tmp_path):
     assert np.ptp(placed[:, 2]) == pytest.approx(0.38)
     assert placed[:, 2].min() == pytest.approx(0, abs=1e-9)
     triangles = skittle.vertices[skittle.faces]
-    assert np.linalg.det(triangles).sum() > 0  # it faces outward
+    assert np.linalg.det(triangles).sum() > 0  # faces point outward
     lengths = np.linalg.norm(np.diff(bell.vertices[bell.faces], axis=1), axis=-1)
     assert lengths.max() < 2.5 * lengths.min()
     states = list(simulate(task))

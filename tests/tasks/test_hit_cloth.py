@@ -29,7 +29,7 @@ def test_the_shipped_task_is_the_one_of_the_paper():
     assert len(sheet.pins["top"]) == 24
     np.testing.assert_allclose(sheet.vertices[:, 1], 0, atol=1e-15)  # hangs vertically
     (goal,) = task.goals()
-    np.testing.assert_allclose(goal.vertices[:, 2], 1.5)  # and shall lie flat
+    np.testing.assert_allclose(goal.vertices[:, 2], 1.5)  # the goal lies flat
     pinned = sheet.pins["top"]
     np.testing.assert_allclose(goal.vertices[pinned], sheet.vertices[pinned], atol=1e-12)
 
@@ -84,7 +84,7 @@ def test_the_gradient_of_the_actions_is_that_of_finite_differences():
     actions = task.actions()
     evaluation = evaluate(task, actions)
     assert evaluation.statistics["largest_contact_count"] > 0
-    # One entry with an effect through contact: the push of the first interval.
+    # One entry that acts through contact: the push of the first interval.
     eps = 1e-5
     losses = []
     for sign in (1, -1):

@@ -1,4 +1,4 @@
-"""Fits of configurations: those that are shipped find what is known, and bad ones are refused."""
+"""Fits of configurations: shipped ones recover known values, bad ones are refused."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from diffcloth_torch.tasks.registry import load_task, read_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
-# Short forms: fewer vertices and larger steps. Without noise, what is left is what mesh and time
-# step do; that is at most this share of the true value.
+# Short forms: fewer vertices and larger steps. Without noise, the remaining error is due to mesh
+# and time step, and is at most this share of the true value.
 SHORT = {
     "fit_cantilever": (
         [
@@ -86,7 +86,7 @@ SHORT = {
 @pytest.mark.parametrize("name", SHORT)
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
-def test_what_is_known_is_found_on_a_coarser_mesh(name):
+def test_known_values_are_found_on_a_coarser_mesh(name):
     changes, shares = SHORT[name]
     first = read_config(CONFIGS / f"{name}.yaml").fit.trajectories
     quiet = [f"fit.trajectories.{k}.noise=1e-6" for k in range(len(first))]
@@ -99,7 +99,7 @@ def test_what_is_known_is_found_on_a_coarser_mesh(name):
 
 
 def test_a_drape_is_fitted_wherever_its_folds_are():
-    """Observed folds that are turned by any angle give the same residuals, those of none."""
+    """Observed folds rotated by any angle have the residuals of unrotated folds."""
     changes = ["scene.cloths.disk.shape.edge_length=0.02", "fit.trajectories.shadow.noise=1.0"]
     changes += ["fit.trajectories.shadow.synthetic.changes=[]", "fit.trajectories.0.directions=72"]
     task = load_task(CONFIGS / "fit_drape.yaml", changes)
@@ -230,7 +230,7 @@ def test_an_outline_is_fitted(config):
 
 
 def test_a_velocity_is_that_of_free_fall(config):
-    """With the start of a real throw, positions are v t + g t^2 / 2 at every step."""
+    """With the correct start of a throw, positions are v t + g t^2 / 2 at every step."""
     changes = [
         "scene.cloths.sheet.pins={}",
         "fit.variables={velocity: {value: [1.0, 0.0, 2.0]}}",
@@ -350,7 +350,7 @@ def test_the_benchmark_runs(option, expected):
     assert re.search(expected, result.stdout), result.stdout
 
 
-def test_what_a_bias_leaves_is_what_random_intervals_count(monkeypatch):
+def test_a_biased_share_is_the_count_of_random_intervals(monkeypatch):
     monkeypatch.syspath_prepend(CONFIGS.parent)
     identification = importlib.import_module("benchmarks.identification")
     biased_share, shares = identification.biased_share, identification.shares

@@ -1,4 +1,4 @@
-"""The recipe of docs/tasks.md: its task and its configuration work as a user would add them."""
+"""The recipe of docs/tasks.md, followed as by a user, yields a working task and configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes of tasks: configurations take them, environments are built from them."""
+"""Scenes of tasks, shared by configurations and environments."""
 
 from __future__ import annotations
 

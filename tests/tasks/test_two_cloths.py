@@ -54,7 +54,7 @@ def test_control_points_are_followed_to_their_last_targets():
     start = task.initial_state()
     ends = torch.tensor([0.0, 0.5, 0.5, 0.5], dtype=torch.float64)
     torch.testing.assert_close(task.distances(start), ends)
-    # A group is where the mean of its vertices is.
+    # The position of a group is the mean of its vertices.
     turned = start.positions.clone()
     turned[42] += torch.tensor([0.0, 0.0, 0.1])
     turned[43] -= torch.tensor([0.0, 0.0, 0.1])

@@ -1,4 +1,4 @@
-"""Pages of the browser: what they hold, and what a browser shows of them."""
+"""Pages of the browser: their content, and their display in a browser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from diffcloth_torch.viewers.layers import colors, strain
 
 pytest.importorskip("viser")
 
-# viser's own, which nobody here can mend.
+# Warnings of viser itself, which cannot be fixed here.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 CHROMIUM = next(
@@ -31,7 +31,7 @@ CHROMIUM = next(
 )
 
 WIDTH, HEIGHT = 640, 480
-# Without what Chromium says of its drawing, and the axes in the corner.
+# Part of the image without Chromium's messages and the axes in the corner.
 FREE = (slice(180, None), slice(80, None))
 
 
@@ -55,7 +55,7 @@ def one(states):
 
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory):
-    """Chromium is there, and can start: in some containers it may not."""
+    """Skip unless Chromium is installed and starts, which some containers do not allow."""
     if CHROMIUM is None:
         pytest.skip("needs Chromium")
     try:
@@ -65,7 +65,7 @@ def chromium(tmp_path_factory):
 
 
 def screenshot(page, file, seconds):
-    """Pixels [height, width, 3] of a page after so many seconds of its own clock."""
+    """Pixels [height, width, 3] of a page after `seconds` of its own clock."""
     import imageio.v2 as imageio
 
     subprocess.run(
@@ -82,10 +82,10 @@ def screenshot(page, file, seconds):
 
 
 def screenshot_of(is_shown, page, file, seconds):
-    """Pixels of a served page once they have what is awaited, or at the third look.
+    """Pixels of a served page once `is_shown` accepts them, or of the third screenshot.
 
-    The clock of a page does not wait for what a server sends over a socket: beside other work an
-    image may be taken before everything has arrived.
+    The clock of a page does not wait for data from a server's socket: on a busy machine an image
+    may be captured before all data has arrived.
     """
     for _ in range(3):
         image = screenshot(page, file, seconds)
@@ -111,7 +111,7 @@ def test_strain_is_that_of_a_stretched_sheet():
     cloth = dc.Cloth.grid(5, 7, size=(1.0, 2.0), pose=[0.1, 0.2, 0.3, 0.5, 0.5, 0.5, 0.5])
     turned = cloth.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     assert strain([cloth], turned).max() < 1e-12
-    # Stretched by a tenth along one side of the sheet, and squeezed by a fifth along the other.
+    # Stretch by a tenth along one side of the sheet, compression by a fifth along the other.
     along = cloth.vertices[6] - cloth.vertices[0]
     along /= np.linalg.norm(along)
     across = cloth.vertices[-7] - cloth.vertices[0]
@@ -123,7 +123,7 @@ def test_strain_is_that_of_a_stretched_sheet():
 def test_colors_go_from_zero_to_the_top():
     found = colors(np.array([[0.0, 1.0], [2.0, 5.0]]), 2.0)
     assert found.shape == (2, 2, 4)
-    assert (found[1, 0] == found[1, 1]).all()  # beyond the top it stays
+    assert (found[1, 0] == found[1, 1]).all()  # constant beyond the top
     assert found[0, 0, :3].sum() < found[0, 1, :3].sum() < found[1, 0, :3].sum()
     assert (colors(np.zeros(3), 0.0) == found[0, 0]).all()
 
@@ -154,7 +154,7 @@ class TestPages:
         import rich
 
         scene, states = falling
-        # As in a notebook, where what is printed is no standard output.
+        # As in a notebook, in which rich does not print to standard output.
         printed = []
         monkeypatch.setattr(rich.get_console(), "is_jupyter", True, raising=False)
         monkeypatch.setattr("rich.jupyter.display", lambda *a: printed.append(a))
@@ -165,7 +165,7 @@ class TestPages:
         assert capsys.readouterr().out == ""
         assert not rich.get_console().quiet
 
-    def test_what_is_shown_later_does_not_change_with_the_tensors(self, falling):
+    def test_a_shown_state_does_not_change_with_its_tensors(self, falling):
         scene, states = falling
         browser = Browser(scene)
         state = states[0].replace(positions=states[0].positions.clone())
@@ -183,7 +183,7 @@ class TestPages:
         late = screenshot(page.as_uri(), tmp_path / "late.png", 12)
         for image in (early, late):
             assert is_blue(image).sum() > 3000  # the sheet
-        # Without the bar of the page below, which moves in any case.
+        # Without the page's bar at the bottom, which always moves.
         assert (np.abs(early - late)[: HEIGHT // 2] > 60).any(axis=-1).sum() > 1000
 
     @pytest.mark.slow
@@ -232,7 +232,7 @@ def test_a_configuration_writes_its_page(tmp_path):
 
 
 def test_an_optimization_shows_the_gradient_of_its_loss(tmp_path, monkeypatch):
-    """By differences: move a vertex after a step, go on, and look at the loss."""
+    """By differences: displace a vertex after a step, continue, and compare losses."""
     task = DYNAMIC.load("simulation.solver.tolerance=1e-9")
     shown = []
     monkeypatch.setattr(Browser, "show", lambda _, *given: shown.append(given))
@@ -316,7 +316,7 @@ class TestFits:
         assert len(shown) == sum(
             cost < min(costs[:k], default=np.inf) for k, cost in enumerate(costs)
         )
-        # What is shown at last are the residuals at the values that were found.
+        # The last display has the residuals at the fitted values.
         tracks, text = shown[-1]
         off = [
             state.positions.numpy() - seen
@@ -332,7 +332,7 @@ class TestFits:
 
     @pytest.mark.slow
     def test_a_page_follows_a_fit(self, falling, chromium, tmp_path):
-        """Its points are those that were observed, and go where they are observed next."""
+        """The page's points are the observed points, and follow the next observation."""
         scene, states = falling
         still = states[0][0]
         page = FittedPage([scene], port=8481, camera=dc.Camera(azimuth=0, elevation=40))
@@ -372,7 +372,7 @@ class TestFits:
         with pytest.raises(dc.InvalidInput, match="one for each of 1 scenes, got 0"):
             FittedPage([scene]).show([])
 
-    def test_what_is_resumed_has_its_viewer_already(self, tmp_path):
+    def test_a_resumed_fit_refuses_another_viewer(self, tmp_path):
         result = CliRunner().invoke(main, ["fit", "--resume", str(tmp_path), "--viewer", "web"])
         assert result.exit_code == 2
         assert "--set or --viewer" in result.output

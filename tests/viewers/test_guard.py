@@ -1,4 +1,4 @@
-"""Whom the server of a page answers, and what a page in a file loads."""
+"""Requests that the server of a page answers, and resources that a page in a file loads."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_server_for_a_network_answers_addresses_and_its_own_name():
 
 
 def test_nothing_makes_the_server_public(browser):
-    """A request of viser's page for a tunnel has no handler, and the page has no button for it."""
+    """Viser's request for a tunnel has no handler, and the page has no button for a tunnel."""
     server = browser._server._websock_server
     known = {kind.__name__ for kind, handlers in server._incoming_handlers.items() if handlers}
     assert known  # of sliders and check boxes
@@ -137,7 +137,7 @@ def test_a_version_of_viser_that_cannot_be_guarded_is_refused(monkeypatch):
 
 
 def console(page, folder):
-    """The messages of a page, of which a policy that is violated makes one, without a network."""
+    """Console messages of a page without a network; a policy violation is one message."""
     result = subprocess.run(
         [
             CHROMIUM, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
@@ -164,7 +164,7 @@ def test_a_page_in_a_file_loads_nothing(states, tmp_path):
         pytest.skip(f"Chromium cannot start here: {error}")
     assert is_blue(image).sum() > 1500
     assert not [m for m in messages if "Content Security Policy" in m], messages
-    # The policy forbids it, and says so.
+    # The policy forbids the image and logs a violation.
     text = page.read_text()
     page.write_text(text.replace("</body>", "<img src='http://192.0.2.7/a.png'></body>"))
     assert [m for m in console(page, tmp_path) if "Content Security Policy" in m]

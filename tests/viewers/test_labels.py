@@ -27,7 +27,7 @@ def test_an_overview_with_a_legend_has_no_blank_cell(count):
         row, column = divmod(k, columns)
         y, x = row * (60 + MARGIN), column * (80 + MARGIN)
         assert (image[y : y + 60, x : x + 80] == 100 + k).all(), k
-    # What is left is one legend, in its middle: a part of the last row, or a strip below full rows.
+    # The rest has one centered legend: a part of the last row, or a strip below full rows.
     strip = image[rows * (60 + MARGIN) - MARGIN :]
     if strip.size:
         assert count == rows * columns
@@ -36,7 +36,7 @@ def test_an_overview_with_a_legend_has_no_blank_cell(count):
     else:
         first = count % columns
         assert first
-        # Where the legend takes several cells, pictures alone would leave a cell empty, too.
+        # If the legend covers several cells, pictures alone would leave a cell empty, too.
         assert columns - first == 1 or count == 13
         left = image[-60:, first * (80 + MARGIN) :]
         ink = np.flatnonzero((left < 250).any(axis=-1).any(axis=0))
@@ -62,7 +62,7 @@ def test_a_legend_keeps_to_a_quarter_of_the_picture(count):
     assert strip.shape[1] == 640
     assert strip.shape[0] % 2 == 0
     assert 20 < strip.shape[0] <= 480 // 4
-    # All of them are there: left upper corners of red rectangles.
+    # All entries are present: count the upper left corners of red rectangles.
     red = np.pad((strip == [255, 0, 0]).all(axis=-1), 1)
     corners = red[1:, 1:] & ~red[:-1, 1:] & ~red[1:, :-1]
     assert corners.sum() == count

@@ -1,4 +1,4 @@
-"""Viewers: which files they leave, and what the pictures show."""
+"""Viewers: their files, and the content of pictures."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def read_image(path):
 
 
 def has_hue(image, channel):
-    """Whether many pixels have one channel well above the others."""
+    """Return whether many pixels have one channel well above the others."""
     others = [c for c in range(3) if c != channel]
     strong = image[..., channel] > 1.6 * np.maximum(*(image[..., c] for c in others)) + 10
     return strong.mean() > 0.003
@@ -172,13 +172,13 @@ def has_hue(image, channel):
 
 @pytest.mark.usefixtures("pictures")
 class TestRecord:
-    def test_the_files_are_there(self, make_task, tmp_path):
+    def test_the_files_exist(self, make_task, tmp_path):
         task = make_task("output.pictures.frames=true", "output.pictures.sheet=2")
         record(task, tmp_path)
         assert (tmp_path / "animation.mp4").stat().st_size > 500
         frames = sorted(path.name for path in (tmp_path / "animation_frames").iterdir())
         assert frames == [f"{k:04d}.png" for k in range(5)]
-        # Frames have the legend inside; the overview has it beside two moments.
+        # Frames contain the legend; the overview has the legend beside two moments.
         frame = read_image(tmp_path / "animation_frames" / "0004.png")
         assert frame.shape == (120, 160, 3)
         overview = read_image(tmp_path / "animation.png")
@@ -198,7 +198,7 @@ class TestRecord:
         legend = cells.pop()
         for color in 255 * np.eye(3, dtype=int):  # of the sheet's front, the ball, the back
             assert (legend == color).all(axis=-1).sum() > 8
-        # The times differ, in the same place; what is shown hardly moves.
+        # The times differ, in the same place of each cell; the scene hardly moves.
         for a, b in itertools.pairwise(cells):
             assert (a[:14, :80] != b[:14, :80]).any()
         assert not (tmp_path / "animation.mp4").exists()
@@ -280,7 +280,7 @@ class TestRecord:
             pytest.param(KeyboardInterrupt(), False, id="interrupt"),
         ],
     )
-    def test_what_led_to_a_failed_step_is_drawn(self, make_task, tmp_path, error, drawn):
+    def test_states_before_a_failed_step_are_drawn(self, make_task, tmp_path, error, drawn):
         task = make_task("output.pictures.video=none")
 
         def failing():
@@ -297,7 +297,7 @@ class TestRecord:
 
 @pytest.fixture(scope="module")
 def landing():
-    """A scene whose sheet lies on a ball, above a floor that is drawn as such."""
+    """A sheet on a ball above a floor, which is drawn as a floor."""
     sheet = dc.Cloth.grid(7, 7, 0.5, pose=[0, 0, 0.31, 1, 0, 0, 0], name="sheet")
     floor = dc.RigidBody.plane(9.0, name="floor")
     ball = dc.RigidBody.sphere(0.15, subdivisions=1, pose=[0, 0, 0.15, 1, 0, 0, 0], name="ball")
@@ -345,7 +345,7 @@ class TestRender:
         for state in states:
             viewer.show(state)
         arrows, entries = viewer._arrows(2.0)
-        forces = states[-1].body_forces.numpy()[4:]  # without those of the floor
+        forces = states[-1].body_forces.numpy()[4:]  # without the forces of the floor
         largest = max(
             np.linalg.norm(state.body_forces.numpy()[4:], axis=1).max() for state in states
         )
@@ -444,7 +444,7 @@ def test_scenes_without_a_cloth_are_drawn(name, file, moments, tmp_path):
     options = {"size": (160, 120), "labels": False, "moments": moments, "contact_forces": True}
     dc.render(simulator.scene, states, path, **options)
     image = read_image(path)
-    # Something stands before the floor and the background, which are much lighter.
+    # Dark pixels show an object; the floor and the background are much lighter.
     assert (image[..., :3].max(axis=-1) < 170).mean() > 0.01
 
 
@@ -484,7 +484,7 @@ def lab(color):
 
 
 def test_the_palette_tells_ten_bodies_apart():
-    """Some 2 is what eyes can tell side by side, 10 are different at a glance."""
+    """A color distance of about 2 is visible side by side, a distance of 10 at a glance."""
     bodies = [Paint().for_body(i).color for i in range(10)]
     cloths = [Paint().for_cloth(i) for i in range(4)]
     others = [color for paint in cloths for color in (paint.color, paint.back_color)]
@@ -526,7 +526,7 @@ class TestCamera:
         with pytest.raises(dc.InvalidInput, match=message):
             dc.Camera(**{"target": [0, 0, 0], **changes})
 
-    def test_what_is_seen_is_what_lies_before_it(self, tmp_path):
+    def test_a_camera_sees_the_objects_in_front(self, tmp_path):
         """A red sheet to the right of a green one, seen from both sides, and upside down."""
         pytest.importorskip("pyvista")
         up = [0.7071, 0.7071, 0, 0]  # stands upright
