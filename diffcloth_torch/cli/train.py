@@ -25,10 +25,17 @@ from diffcloth_torch.cli.results import (
     write_metrics,
     write_resume,
 )
+from diffcloth_torch.cli.stages import Stages
 from diffcloth_torch.config.documents import read_document, set_values
-from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
+from diffcloth_torch.config.train_schema import (
+    TrainConfig,
+    TryoutSection,
+    UpdateStage,
+    WorkersSection,
+)
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn import imitation
 from diffcloth_torch.learn.evaluation import evaluate, follow
 from diffcloth_torch.learn.options import TrainerOptions, name_now
 from diffcloth_torch.learn.policy import Policy
@@ -52,6 +59,7 @@ _REPORT = {
     "blocked": 0.0, "return": 0.0, "steps": 0, "minutes": 0.0,
 }  # fmt: skip
 _LOOKS = 5  # at policies, of which the best one is kept
+_SHAPE = ("plan_knots", "hidden", "init_std")  # options that shape a policy
 _NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # set by the trainer
 
 _Workers = Processes | RayActors | Ranks | None
@@ -119,15 +127,18 @@ class _Job:
 
     def __init__(self, section: TrainConfig, source: Path, workers: _Workers) -> None:
         self.section, self._source = section, source.resolve()
-        self._options = _named(f"{source}: `trainer`", TrainerOptions, section.trainer)
+        self._options = _named(f"{source}: `trainer`", TrainerOptions, _options(section))
         self._workers = workers
         self.writes = _writes(workers)
+        self._updates = _updates(section)
         self.trainer = self._make(self._options)
+        before = [stage for stage in section.stages if not isinstance(stage, UpdateStage)]
+        self._stages = Stages(before, self._make_env, self._options, workers)
         self._tried: list[dict[str, Any]] = []
         self._best: dict[str, Any] | None = None
         self._report: dict[str, Any] | None = None
 
-    def _make(self, options: TrainerOptions) -> Trainer:
+    def _make(self, options: TrainerOptions, init: Policy | None = None) -> Trainer:
         section, env = self.section, self.section.environment
         for name in _NOT_THERE:
             if name in env.options:
@@ -143,6 +154,7 @@ class _Job:
             chunk=section.chunk,
             workers=self._workers,
             threads=section.workers.threads,
+            init=init,
         )
 
     def keep(
@@ -165,6 +177,7 @@ class _Job:
             "trainer": trainer,
             "best": self._best,
             "report": self._report,
+            "stages": self._stages.record(),
         }
         write_resume(out, "train", document, self._source, **found)
 
@@ -178,6 +191,9 @@ class _Job:
             for k, entry in enumerate(kept[name]):
                 check_like(f"`{name}[{k}]`", entry, example)
         evaluations: list[dict[str, Any]] = kept["evaluations"]
+        if kept.get("stages") is not None:
+            self._stages.restore(kept["stages"], copy.deepcopy(self.trainer.policy))
+            self._begin_at_stages()
         if kept["trainer"] is not None:
             updates = kept["trainer"]["counts"][1]
             if not evaluations or evaluations[-1]["updates"] != updates:
@@ -199,11 +215,15 @@ class _Job:
         """Learn until the end, and write the results."""
         if self._report is not None:
             return f"nothing is left to do: {self.trainer.updates} updates are done"
-        before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
+        spent = evaluations[-1]["seconds"] if evaluations else self._stages.seconds
+        before = time.perf_counter() - spent
         try:
+            if not evaluations:
+                self._stages.run(partial(self._keep_stages, out))
+                self._begin_at_stages()
             if self.section.tryout is not None:
                 evaluations = self._try_out(out, self.section.tryout, before)
-            self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
+            self._learn(self._updates, evaluations, before, out / _EVENTS, out)
             self._report = self._reported(evaluations)
         except KeyboardInterrupt as error:
             kept = evaluations[-1]["updates"] if evaluations else 0
@@ -227,6 +247,15 @@ class _Job:
             f"{found['minutes']:.1f} minutes; results are in {out}"
         )
 
+    def _begin_at_stages(self) -> None:
+        """Replace the trainer by one that begins at the policy of the stages, if there is one."""
+        if self._stages.policy is not None:
+            self.trainer = self._make(self._options, self._stages.policy)
+
+    def _keep_stages(self, out: Path) -> None:
+        if self.writes:
+            self.keep(out, [])
+
     def _try_out(self, out: Path, tryout: TryoutSection, before: float) -> list[dict[str, Any]]:
         """Train each seed for a while; this object then trains the best one.
 
@@ -237,7 +266,7 @@ class _Job:
         for seed in tryout.seeds:
             self.trainer, self._best = self._make(replace(self._options, seed=seed)), None
             evaluations: list[dict[str, Any]] = []
-            updates = min(tryout.updates, self.section.updates)
+            updates = min(tryout.updates, self._updates)
             self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
             self._tried.append({"seed": seed, **evaluations[-1]})
             found.append((self.trainer, self._best, evaluations))
@@ -287,7 +316,7 @@ class _Job:
                     bar.update()
                     for name, value in scalars.items() if events else ():
                         events.add_scalar(name, value, trainer.steps)
-                    if trainer.updates == section.updates:
+                    if trainer.updates == self._updates:
                         self._check()
                     is_last = trainer.updates == updates
                     if trainer.updates % section.evaluate_every and not is_last:
@@ -321,12 +350,17 @@ class _Job:
             self.trainer.check()
 
     def _is_looked_at(self, evaluations: list[dict[str, Any]]) -> bool:
-        """Whether a policy that was evaluated is the last one, or the first one of a fifth."""
-        if self._succeeds(evaluations):
+        """Return whether an evaluated policy is compared with the best one.
+
+        These are the last one, the first one of each share of the updates, and a policy of stages.
+        """
+        begins = len(evaluations) == 1 and bool(self.section.stages)
+        if begins or self._succeeds(evaluations):
             return True
         updates = [each["updates"] for each in evaluations[-2:]]
-        fifths = [_LOOKS * count // self.section.updates for count in updates]
-        return bool(fifths[-1] > fifths[0])
+        looks = _LOOKS - bool(self.section.stages)
+        shares = [looks * count // max(self._updates, 1) for count in updates]
+        return bool(shares[-1] > shares[0])
 
     def _look(self) -> None:
         """Keep the policy if it is better than the best one so far."""
@@ -394,6 +428,7 @@ class _Job:
             "evaluations": evaluations,
             "tried": self._tried,
             "starts": self._starts,
+            "stages": self._stages.done,
             "best": best,
             "report": self._report,
         }
@@ -418,6 +453,27 @@ class _Job:
                     record.show(state[0])
         if "web" in self.section.viewers:
             show(scene, states, out / f"{_VIDEO}.html", camera=camera)
+
+
+def _options(section: TrainConfig) -> dict[str, Any]:
+    """Return the options of the trainer by their names; stages have others by default."""
+    given = dict(section.trainer)
+    if section.seed is not None:
+        given["seed"] = section.seed
+    if not section.stages:
+        return given
+    shape = {name: getattr(imitation.OPTIONS, name) for name in _SHAPE}
+    last = section.stages[-1]
+    algorithm = last.kind if isinstance(last, UpdateStage) else imitation.OPTIONS.algorithm
+    return {**shape, "algorithm": algorithm, **given}
+
+
+def _updates(section: TrainConfig) -> int:
+    """Return the number of updates of the policy by the trainer."""
+    if not section.stages:
+        return section.updates
+    last = section.stages[-1]
+    return last.updates if isinstance(last, UpdateStage) else 0
 
 
 def _writes(workers: _Workers) -> bool:

@@ -25,12 +25,14 @@ from diffcloth_torch.learn.starts import LARGEST_SEED, part_seeds
 from diffcloth_torch.memory import check_memory
 from diffcloth_torch.operations import called
 
-__all__ = ["Teacher", "imitate"]
+__all__ = ["OPTIONS", "Teacher", "imitate"]
 
 Teacher = Callable[[Tensor, ClothVectorEnv], Tensor]
 """A function of observations [B, O] and environments that returns actions [B, A]."""
 
-_OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), init_std=0.05)
+OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), init_std=0.05)
+"""Options that shape a policy that imitates, by default."""
+
 _NOISE = 0.1  # standard deviation of the noise on the actions of a teacher that drives
 _NOISY = 0.5  # share of them that have noise
 _RATE = 3e-3  # of Adam at first; it falls to 0 along a cosine
@@ -84,7 +86,7 @@ def imitate(
     check_count("imitate: `episodes`", episodes, 1)
     check_count("imitate: `seed`", seed, 0, LARGEST_SEED)
     check_count("imitate: `iterations`", iterations, 1)
-    given: object = _OPTIONS if options is None else options
+    given: object = OPTIONS if options is None else options
     if not isinstance(given, TrainerOptions):
         raise TypeError(f"imitate: `options` must be TrainerOptions, got {type(given).__name__}")
     with threads_of_torch(1):

@@ -289,7 +289,7 @@ def test_a_swinging_sheet_is_found_without_the_bias_of_its_time_step():
         every = round(0.03 / step)
         return sim.rollout(
             start.replace(velocities=speed * turning),
-            parameters=sim.parameters().replace(**given),
+            parameters=sim.default_parameters().replace(**given),
             steps=20 * every,
         )[every - 1 :: every]
 
