@@ -39,9 +39,9 @@ class Job:
 
 JOBS = {
     # An odd size, so that a row of vertices lies on the fold line; otherwise no policy succeeds.
-    "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 10_000),
-    "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
-    "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
+    "FoldCloth": Job("configs/train_fold_gradients.yaml", 9, 1400, 10_000),
+    "PushCube": Job("configs/train_push_gradients.yaml", 8, 640, 1600),
+    "LiftCloth": Job("configs/train_lift_gradients.yaml", 6, 600, 1500),
 }
 FIRST_ORDER, FREE = ("planned", "apg", "shac", "sapo"), ("ppo", "sac")
 ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
