@@ -86,9 +86,19 @@ class MeshFile(Section):
 
 
 class ClothFile(MeshFile):
-    """A mesh file of a cloth, and a second one of its stress-free shape if that differs."""
+    """A mesh file of a cloth, and a second one of its stress-free shape if that differs.
+
+    "uv" takes the texture of the file as stress-free shape, `rest_scale` meters per unit.
+    """
 
     rest: str | None = None
+    rest_scale: Positive | None = None
+
+    @model_validator(mode="after")
+    def _check_rest(self) -> ClothFile:
+        if (self.rest == "uv") != (self.rest_scale is not None):
+            raise ValueError("must give `rest_scale` with `rest: uv`, and only with it")
+        return self
 
 
 class Grid(Section):
