@@ -86,6 +86,8 @@ class Simulator:
         vertices: NDArray[np.float64],
         rest_positions: NDArray[np.float64],
         faces: NDArray[np.int32],
+        rest_embedding: NDArray[np.float64] = ...,
+        rest_faces: NDArray[np.int32] = ...,
         material_axes: NDArray[np.float64],
         cloth_vertex_start: NDArray[np.int32],
         cloth_face_start: NDArray[np.int32],

@@ -106,8 +106,9 @@ bool is_needed(const step::Scene& scene, const step::Inputs& inputs, const step:
 void check_description(const step::Description& d) {
   const std::size_t vertices = d.vertices.size() / 3;
   const std::size_t cloths = d.bending_models.size();
-  require(d.vertices.size() % 3 == 0 && d.rest_positions.size() == d.vertices.size(),
-          "`vertices` and `rest_positions` must have one shape, [N, 3]");
+  require(d.vertices.size() % 3 == 0 && d.rest_embedding.size() == d.vertices.size(),
+          "`vertices` and `rest_embedding` must have one shape, [N, 3]");
+  require(d.rest_positions.size() % 3 == 0, "`rest_positions` must have the shape [M, 3]");
   check_faces("faces", d.faces, vertices);
   check_starts("cloth_vertex_start", d.cloth_vertex_start, cloths, vertices);
   check_starts("cloth_face_start", d.cloth_face_start, cloths, d.faces.size());
@@ -163,6 +164,8 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Extent extent
       return {3};
     case Extent::kVertices:
       return {3 * static_cast<std::size_t>(scene.cloth_vertex_count())};
+    case Extent::kRestVertices:
+      return {3 * static_cast<std::size_t>(scene.rest_vertex_count())};
     case Extent::kAllVertices:
       return {3 * static_cast<std::size_t>(scene.vertex_count())};
     case Extent::kPins:

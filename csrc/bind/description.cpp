@@ -143,6 +143,9 @@ void take_surfaces(NamedFields& fields, step::Description& d) {
   d.vertices = fields.doubles("vertices");
   d.rest_positions = fields.doubles("rest_positions");
   d.faces = to_faces(fields.indices("faces"));
+  const bool has_seams = fields.has("rest_faces");
+  d.rest_faces = has_seams ? to_faces(fields.indices("rest_faces")) : d.faces;
+  d.rest_embedding = has_seams ? fields.doubles("rest_embedding") : d.rest_positions;
   d.cloth_vertex_start = fields.indices("cloth_vertex_start");
   d.cloth_face_start = fields.indices("cloth_face_start");
   for (const std::string& model : fields.take<Names>("bending_models")) {

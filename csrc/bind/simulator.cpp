@@ -82,7 +82,7 @@ nb::dict Simulator::stored_energy(const nb::dict& inputs) const {
 
 double Simulator::smallest_nonadjacent_distance() const {
   // Positions of bodies do not matter: only cloths are measured.
-  std::vector<double> x = scene_.given.rest_positions;
+  std::vector<double> x = scene_.given.rest_embedding;
   x.resize(3 * static_cast<std::size_t>(scene_.vertex_count()), 0.0);
   return contact::smallest_nonadjacent_distance(scene_.collision_mesh, x.data());
 }

@@ -112,7 +112,7 @@ std::array<Scalar, 4> hinge_weights(const std::array<Scalar, 8>& u) {
 
 /// Local vertices a, b, c, d of a hinge.
 std::array<int, 4> hinge_corners(const BendingStencils& stencils, Index e) {
-  const auto [a, b] = stencils.unfolding(e)[3];
+  const auto [a, b] = stencils.unfolding(e)[3].edge;
   return {a, b, 3 - a - b, 3};
 }
 

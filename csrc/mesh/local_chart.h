@@ -6,6 +6,7 @@
 
 #include "common/types.h"
 #include "mesh/curvature_fit.h"
+#include "mesh/rest_shape.h"
 #include "mesh/unfolding.h"
 
 namespace diffcloth::mesh {
@@ -21,29 +22,43 @@ struct Chart {
   double area() const { return 0.5 * base.length * base.b; }
 };
 
-/// The coordinates of three vertices, one after the other.
-inline std::array<double, 9> corners(const double* X, Index i, Index j, Index k) {
+/// The coordinates of three rest vertices, one after the other.
+inline std::array<double, 9> corners(const double* X, const std::array<Index, 3>& v) {
   std::array<double, 9> result;
   for (int c = 0; c < 3; ++c) {
-    result[c] = X[3 * i + c];
-    result[3 + c] = X[3 * j + c];
-    result[6 + c] = X[3 * k + c];
+    result[c] = X[3 * v[0] + c];
+    result[3 + c] = X[3 * v[1] + c];
+    result[6 + c] = X[3 * v[2] + c];
   }
   return result;
 }
 
-inline Chart chart(std::span<const Index> vertices,
-                   std::span<const std::array<Index, 2>> unfold_edge,
-                   const double* X) {
+/// Call with the ends of an edge in the rest mesh and its share in the mean: once, or for both edges of
+/// a seam.
+template <class Function>
+void for_each_rest_edge(const Topology& topology, std::size_t e, const Function& function) {
+  const RestEdge& edge = topology.rest_edges[e];
+  const double share = edge.is_seam() ? 0.5 : 1.0;
+  function(edge.first[0], edge.first[1], share);
+  if (edge.is_seam()) function(edge.last[0], edge.last[1], share);
+}
+
+/// The points of a chart that has no others than its base face, from that face's rest vertices.
+inline std::array<Unfolding, 3> base_points(const std::array<Index, 3>& rest_face) {
+  const Unfolding corner{.edge = {-1, -1}, .rest = rest_face};
+  return {corner, corner, corner};
+}
+
+inline Chart chart(std::span<const Unfolding> points, const double* X) {
   Chart result;
-  result.base = base_triangle(corners(X, vertices[0], vertices[1], vertices[2]));
-  result.size = static_cast<int>(vertices.size());
+  result.base = base_triangle(corners(X, points[0].rest));
+  result.size = static_cast<int>(points.size());
   result.u[0] = Vec2::Zero();
   result.u[1] = Vec2(result.base.length, 0.0);
   result.u[2] = Vec2(result.base.a, result.base.b);
   for (int j = 3; j < result.size; ++j) {
-    const auto [a, b] = unfold_edge[j];
-    result.foot[j] = unfold(corners(X, vertices[a], vertices[b], vertices[j]));
+    const auto [a, b] = points[j].edge;
+    result.foot[j] = unfold(corners(X, points[j].rest));
     result.u[j] = place(result.u[a], result.u[b], result.foot[j]);
   }
   return result;

@@ -31,7 +31,7 @@ struct Fits {
 
   Fits(const BendingStencils& stencils, const double* X) {
     for (Index k = 0; k < stencils.chart_count(); ++k) {
-      chart.push_back(mesh::chart(stencils.points(k), stencils.unfolding(k), X));
+      chart.push_back(mesh::chart(stencils.unfolding(k), X));
     }
     for (Index e = 0; e < stencils.size(); ++e) c.push_back(fit_operator(stencils, e, chart[e]));
     for (std::size_t s = 0; s < stencils.sides.size(); ++s) {
@@ -116,14 +116,14 @@ inline std::vector<double> curvature_operator(const BendingStencils& stencils, c
   return result;
 }
 
-/// Second derivatives sum_i c_ab,i X_i, one a column.
-inline Mat3 second_derivatives(std::span<const Index> vertices,
+/// Second derivatives sum_i c_ab,i X_i of an element, one a column.
+inline Mat3 second_derivatives(std::span<const Index> rest_vertices,
                                const ConstOperatorMap& c,
                                const double* X) {
-  const Vec3 origin = row(X, vertices[0]);
+  const Vec3 origin = row(X, rest_vertices[0]);
   Mat3 result = Mat3::Zero();
-  for (std::size_t i = 1; i < vertices.size(); ++i) {
-    result += (row(X, vertices[i]) - origin) * c.col(static_cast<int>(i)).transpose();
+  for (std::size_t i = 1; i < rest_vertices.size(); ++i) {
+    result += (row(X, rest_vertices[i]) - origin) * c.col(static_cast<int>(i)).transpose();
   }
   return result;
 }

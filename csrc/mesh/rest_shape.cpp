@@ -68,7 +68,8 @@ void element_side_vjp(const BendingStencils& stencils,
 /// coordinates far from the origin.
 double flat_threshold(const Topology& topology, const double* X, double area) {
   double extent = 0.0;
-  for (Index i = 0; i < 3 * topology.vertex_count; ++i) extent = std::max(extent, std::abs(X[i]));
+  for (Index i = 0; i < 3 * topology.rest_vertex_count; ++i)
+    extent = std::max(extent, std::abs(X[i]));
   return std::max(1e-12, 32.0 * std::numeric_limits<double>::epsilon() * extent / std::sqrt(area));
 }
 
@@ -76,15 +77,12 @@ double flat_threshold(const Topology& topology, const double* X, double area) {
 
 void add_corner_bar(std::span<const Dual9> outputs,
                     std::span<const double> bars,
-                    Index i,
-                    Index j,
-                    Index k,
+                    const std::array<Index, 3>& v,
                     double* X_bar) {
   Eigen::Matrix<double, 9, 1> total = Eigen::Matrix<double, 9, 1>::Zero();
   for (std::size_t o = 0; o < outputs.size(); ++o) total += bars[o] * outputs[o].derivative;
-  const std::array<Index, 3> vertices{i, j, k};
   for (int p = 0; p < 3; ++p) {
-    Eigen::Map<Vec3>(X_bar + 3 * vertices[p]) += total.segment<3>(3 * p);
+    Eigen::Map<Vec3>(X_bar + 3 * v[p]) += total.segment<3>(3 * p);
   }
 }
 
@@ -92,23 +90,22 @@ void base_triangle_vjp(const std::array<Index, 3>& v,
                        const double* X,
                        const ChartBar& bar,
                        double* X_bar) {
-  const BaseTriangle<Dual9> base = base_triangle(variables<9>(corners(X, v[0], v[1], v[2])));
+  const BaseTriangle<Dual9> base = base_triangle(variables<9>(corners(X, v)));
   std::array<Dual9, 12> outputs{base.length, base.a, base.b};
   std::array<double, 12> bars{bar.length, bar.a, bar.b};
   std::copy(base.frame.begin(), base.frame.end(), outputs.begin() + 3);
   std::copy(bar.frame.begin(), bar.frame.end(), bars.begin() + 3);
-  add_corner_bar(outputs, bars, v[0], v[1], v[2], X_bar);
+  add_corner_bar(outputs, bars, v, X_bar);
 }
 
 /// Undo chart(), last vertex first: u_j = u_a + along (u_b - u_a) + off right(u_b - u_a).
-void chart_vjp(std::span<const Index> vertices,
-               std::span<const std::array<Index, 2>> unfold_edge,
+void chart_vjp(std::span<const Unfolding> points,
                const Chart& chart,
                const double* X,
                ChartBar& bar,
                double* X_bar) {
   for (int j = chart.size - 1; j >= 3; --j) {
-    const auto [a, b] = unfold_edge[j];
+    const auto [a, b] = points[j].edge;
     const Vec2 edge = chart.u[b] - chart.u[a];
     const Vec2 u_bar = bar.u[j];
     const auto [along, off] = chart.foot[j];
@@ -117,15 +114,14 @@ void chart_vjp(std::span<const Index> vertices,
     bar.u[a] += u_bar - edge_bar;
     bar.u[b] += edge_bar;
 
-    const Foot<Dual9> foot =
-        unfold(variables<9>(corners(X, vertices[a], vertices[b], vertices[j])));
+    const Foot<Dual9> foot = unfold(variables<9>(corners(X, points[j].rest)));
     const std::array<Dual9, 2> outputs{foot.along, foot.off};
-    add_corner_bar(outputs, foot_bar, vertices[a], vertices[b], vertices[j], X_bar);
+    add_corner_bar(outputs, foot_bar, points[j].rest, X_bar);
   }
   bar.length += bar.u[1].x();
   bar.a += bar.u[2].x();
   bar.b += bar.u[2].y();
-  base_triangle_vjp({vertices[0], vertices[1], vertices[2]}, X, bar, X_bar);
+  base_triangle_vjp(points[0].rest, X, bar, X_bar);
 }
 
 /// Pull back b = R^T sum_i (X_i - X_0) c_i^T to X, to the frame R and to c.
@@ -156,14 +152,15 @@ void bending_vjp(const BendingStencils& stencils,
   FitsBar fits_bar(fits);
   std::vector<ChartBar> chart_bar(fits.chart.size());
   for (Index e = 0; e < stencils.size(); ++e) {
-    const std::span<const Index> vertices = stencils.element(e);
-    const auto size = static_cast<Index>(vertices.size());
+    const auto size = static_cast<Index>(stencils.element(e).size());
     const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
     OperatorMap element_bar = element_columns(stencils, e, c_bar);
-    Mat3 frame_bar;
-    curvature_vjp(vertices, ConstOperatorMap(c.data() + offset, 3, size), X, bar.curvature[e],
-                  fits.chart[e].frame(), frame_bar, element_bar, X_bar);
-    Eigen::Map<Mat3>(chart_bar[e].frame.data()) = frame_bar;
+    if (stencils.sewn[e] == 0) {
+      Mat3 frame_bar;
+      curvature_vjp(stencils.rest_element(e), ConstOperatorMap(c.data() + offset, 3, size), X,
+                    bar.curvature[e], fits.chart[e].frame(), frame_bar, element_bar, X_bar);
+      Eigen::Map<Mat3>(chart_bar[e].frame.data()) = frame_bar;
+    }
     fits_bar.c[e] += element_bar.leftCols(fits.c[e].cols());
   }
   for_each_element_side(stencils, [&](const ElementSide& part) {
@@ -188,14 +185,14 @@ void bending_vjp(const BendingStencils& stencils,
     for (Index i = 0; i < u_bar.rows(); ++i) local_bar.u[i] = u_bar.row(i).transpose();
   }
   for (Index k = 0; k < stencils.chart_count(); ++k) {
-    chart_vjp(stencils.points(k), stencils.unfolding(k), fits.chart[k], X, chart_bar[k], X_bar);
+    chart_vjp(stencils.unfolding(k), fits.chart[k], X, chart_bar[k], X_bar);
   }
 }
 
 void face_vjp(
     const Topology& topology, Index f, const double* X, const RestShapeBar& bar, double* X_bar) {
   const std::array<Index, 3>& face = topology.faces[f];
-  const Chart local = chart(face, {}, X);
+  const Chart local = chart(base_points(topology.rest_faces[f]), X);
   double area_bar = bar.area[f];
   for (int p = 0; p < 3; ++p) {
     area_bar += (bar.vertex_area[face[p]] + bar.edge_area[topology.face_edges[f][p]]) / 3.0;
@@ -210,7 +207,7 @@ void face_vjp(
   local_bar.length += base_bar(0);
   local_bar.a += base_bar(1);
   local_bar.b += base_bar(2);
-  base_triangle_vjp(face, X, local_bar, X_bar);
+  base_triangle_vjp(topology.rest_faces[f], X, local_bar, X_bar);
 }
 
 void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
@@ -222,7 +219,7 @@ void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
   rest.edge_length_sq.resize(topology.edges.size());
   for (Index f = 0; f < face_count; ++f) {
     const std::array<Index, 3>& face = topology.faces[f];
-    const Chart local = chart(face, {}, X);
+    const Chart local = chart(base_points(topology.rest_faces[f]), X);
     const std::array<double, 6> g = shape_gradient(local.base.length, local.base.a, local.base.b);
     for (int k = 0; k < 6; ++k) rest.shape_gradient[f](k / 2, k % 2) = g[k];
     rest.area[f] = local.area();
@@ -232,8 +229,11 @@ void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
     }
   }
   for (std::size_t e = 0; e < topology.edges.size(); ++e) {
-    const auto [v0, v1] = topology.edges[e];
-    rest.edge_length_sq[e] = (row(X, v1) - row(X, v0)).squaredNorm();
+    double& length_sq = rest.edge_length_sq[e];
+    length_sq = 0.0;
+    for_each_rest_edge(topology, e, [&](Index v0, Index v1, double share) {
+      length_sq += share * (row(X, v1) - row(X, v0)).squaredNorm();
+    });
   }
 }
 
@@ -247,13 +247,18 @@ RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, 
   rest.curvature.resize(stencils.size());
   rest.bending_area.resize(stencils.size());
   for (Index e = 0; e < stencils.size(); ++e) {
-    const std::span<const Index> vertices = stencils.element(e);
+    const std::span<const Index> rest_vertices = stencils.rest_element(e);
     const ConstOperatorMap c(
         rest.curvature_operator.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]), 3,
-        static_cast<Index>(vertices.size()));
+        static_cast<Index>(rest_vertices.size()));
     const bool patch = stencils.model[e] == BendingModel::kPatch;
     rest.bending_area[e] = patch ? fits.chart[e].area() : 1.0;
-    rest.curvature[e] = fits.chart[e].frame().transpose() * second_derivatives(vertices, c, X);
+    if (stencils.sewn[e] != 0) {
+      rest.curvature[e].setZero();
+    } else {
+      rest.curvature[e] =
+          fits.chart[e].frame().transpose() * second_derivatives(rest_vertices, c, X);
+    }
   }
   if (rest.area.empty()) return rest;
 
@@ -307,10 +312,11 @@ void rest_shape_vjp(const Topology& topology,
   }
   bending_vjp(stencils, X, bar, X_bar);
   for (std::size_t e = 0; e < topology.edges.size(); ++e) {
-    const auto [v0, v1] = topology.edges[e];
-    const Vec3 bar_v1 = 2.0 * bar.edge_length_sq[e] * (row(X, v1) - row(X, v0));
-    Eigen::Map<Vec3>(X_bar + 3 * v1) += bar_v1;
-    Eigen::Map<Vec3>(X_bar + 3 * v0) -= bar_v1;
+    for_each_rest_edge(topology, e, [&](Index v0, Index v1, double share) {
+      const Vec3 bar_v1 = 2.0 * share * bar.edge_length_sq[e] * (row(X, v1) - row(X, v0));
+      Eigen::Map<Vec3>(X_bar + 3 * v1) += bar_v1;
+      Eigen::Map<Vec3>(X_bar + 3 * v0) -= bar_v1;
+    });
   }
 }
 

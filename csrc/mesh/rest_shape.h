@@ -30,27 +30,39 @@ struct FittedSide {
   std::array<Index, 2> corner;   ///< corner of the base triangle opposite the side
 };
 
+/// Source of a point of a chart: a corner of the base face, or a point unfolded about an edge.
+struct Unfolding {
+  std::array<Index, 2> edge;  ///< local edge a -> b, to whose right it lies; {-1, -1} for a corner
+  std::array<Index, 3>
+      rest;  ///< rest vertices of a, b and the point, in one face; of the base face
+};
+
 /// Vertices that each bending element couples.
 ///
 /// The first three vertices of an element are the corners of its base face, followed by the other points
 /// of its quadratic, unless all its sides are fitted, and by the points of the fitted sides. The points
-/// of a quadratic, or of a side, are mapped to the plane of a base face by unfolding the mesh. Stencils
-/// are chosen once, from the scene's rest mesh, so that everything is smooth in the rest positions.
+/// of a quadratic, or of a side, are mapped to the plane of a base face by unfolding the mesh. A seam is
+/// unfolded as if sewn flat: the triangle beyond it is scaled until its edge is as long as the edge of
+/// the face before it. Stencils are chosen once, from the scene's rest mesh, so that everything is smooth
+/// in the rest positions.
 struct BendingStencils {
   std::vector<Index> start{0};              ///< [B + 1] into `vertices`
   std::vector<Index> vertices;              ///< [start.back()]
+  std::vector<Index> rest_vertices;         ///< [start.back()] of elements that are not sewn
+  std::vector<char> sewn;                   ///< [B] whether a seam crosses it: it is flat at rest
   std::vector<std::array<Index, 2>> faces;  ///< [B] base face; other face of a hinge or -1
   std::vector<BendingModel> model;          ///< [B]
   std::vector<FittedSide> sides;            ///< [S]
   std::vector<Index> chart_start{0};        ///< [B + S + 1] into `chart_points`
   std::vector<Index> chart_points;          ///< points of each element, then of each side
-  /// [chart_start.back()] Local edge a -> b about which an extra point is unfolded, to the right of the
-  /// edge. Corners of the base face have {-1, -1}.
-  std::vector<std::array<Index, 2>> unfold_edge;
+  std::vector<Unfolding> unfoldings;        ///< [chart_start.back()]
 
   Index size() const { return static_cast<Index>(faces.size()); }
   std::span<const Index> element(Index e) const {
     return {vertices.data() + start[e], static_cast<std::size_t>(start[e + 1] - start[e])};
+  }
+  std::span<const Index> rest_element(Index e) const {
+    return {rest_vertices.data() + start[e], static_cast<std::size_t>(start[e + 1] - start[e])};
   }
   Index chart_count() const { return static_cast<Index>(chart_start.size()) - 1; }
   Index side_chart(Index s) const { return size() + s; }
@@ -58,15 +70,15 @@ struct BendingStencils {
     return {chart_points.data() + chart_start[chart],
             static_cast<std::size_t>(chart_start[chart + 1] - chart_start[chart])};
   }
-  std::span<const std::array<Index, 2>> unfolding(Index chart) const {
-    return {unfold_edge.data() + chart_start[chart], points(chart).size()};
+  std::span<const Unfolding> unfolding(Index chart) const {
+    return {unfoldings.data() + chart_start[chart], points(chart).size()};
   }
 };
 
 /// One patch for each face with this model and a neighbor; one hinge for each interior edge between two
 /// faces with that model.
 ///
-/// @param X           rest positions, [N, 3] [m]
+/// @param X           positions of the rest vertices, [M, 3] [m]
 /// @param face_model  one a face
 BendingStencils choose_stencils(const Topology& topology,
                                 const double* X,
@@ -82,12 +94,13 @@ struct RestShape {
   /// [start.back()] x 3: the weights (c_uu, c_uv, c_vv) of each stencil vertex,
   /// x,ab = sum_i c_ab,i x_i [1/m^2].
   std::vector<double> curvature_operator;
-  /// [B] columns b_uu, b_uv, b_vv: second derivatives X,ab in the rest frame (r1, r2, n) [1/m].
+  /// [B] columns b_uu, b_uv, b_vv: second derivatives X,ab in the rest frame (r1, r2, n) [1/m]; 0 of
+  /// sewn elements.
   std::vector<Mat3> curvature;
   std::vector<double> bending_area;    ///< [B] weight of an element: A of a patch, 1 of a hinge
   std::vector<double> vertex_area;     ///< [N] a third of the adjacent faces [m^2]
   std::vector<double> edge_area;       ///< [E] a third of the adjacent faces [m^2]
-  std::vector<double> edge_length_sq;  ///< [E] [m^2]
+  std::vector<double> edge_length_sq;  ///< [E] mean over both faces, which differ at a seam [m^2]
   bool curved = false;                 ///< some curvature exceeds rounding; others are exactly 0
 };
 

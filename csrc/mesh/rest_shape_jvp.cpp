@@ -17,24 +17,24 @@ Dual1 dual(double value, double change) {
 
 double change_of(const Dual1& number) { return number.derivative(0); }
 
-/// The coordinates of three vertices, with their changes.
-std::array<Dual1, 9> dual_corners(const double* X, const double* X_dot, Index i, Index j, Index k) {
-  const std::array<double, 9> values = corners(X, i, j, k);
-  const std::array<double, 9> changes = corners(X_dot, i, j, k);
+/// The coordinates of three rest vertices, with their changes.
+std::array<Dual1, 9> dual_corners(const double* X,
+                                  const double* X_dot,
+                                  const std::array<Index, 3>& v) {
+  const std::array<double, 9> values = corners(X, v);
+  const std::array<double, 9> changes = corners(X_dot, v);
   std::array<Dual1, 9> result;
   for (int c = 0; c < 9; ++c) result[c] = dual(values[c], changes[c]);
   return result;
 }
 
 /// Change of a chart.
-ChartBar chart_jvp(std::span<const Index> vertices,
-                   std::span<const std::array<Index, 2>> unfold_edge,
+ChartBar chart_jvp(std::span<const Unfolding> points,
                    const Chart& chart,
                    const double* X,
                    const double* X_dot) {
   ChartBar dot;
-  const BaseTriangle<Dual1> base =
-      base_triangle(dual_corners(X, X_dot, vertices[0], vertices[1], vertices[2]));
+  const BaseTriangle<Dual1> base = base_triangle(dual_corners(X, X_dot, points[0].rest));
   dot.length = change_of(base.length);
   dot.a = change_of(base.a);
   dot.b = change_of(base.b);
@@ -42,8 +42,8 @@ ChartBar chart_jvp(std::span<const Index> vertices,
   dot.u[1] = Vec2(dot.length, 0.0);
   dot.u[2] = Vec2(dot.a, dot.b);
   for (int j = 3; j < chart.size; ++j) {
-    const auto [a, b] = unfold_edge[j];
-    const Foot<Dual1> foot = unfold(dual_corners(X, X_dot, vertices[a], vertices[b], vertices[j]));
+    const auto [a, b] = points[j].edge;
+    const Foot<Dual1> foot = unfold(dual_corners(X, X_dot, points[j].rest));
     const Vec2 edge = chart.u[b] - chart.u[a];
     const Vec2 edge_dot = dot.u[b] - dot.u[a];
     const auto right = [](const Vec2& v) { return Vec2(v.y(), -v.x()); };
@@ -79,8 +79,7 @@ FitsChange fits_jvp(const BendingStencils& stencils,
                     const double* X_dot) {
   FitsChange dot;
   for (Index k = 0; k < stencils.chart_count(); ++k) {
-    dot.chart.push_back(
-        chart_jvp(stencils.points(k), stencils.unfolding(k), fits.chart[k], X, X_dot));
+    dot.chart.push_back(chart_jvp(stencils.unfolding(k), fits.chart[k], X, X_dot));
   }
   for (Index e = 0; e < stencils.size(); ++e) {
     dot.c.push_back(fit_operator_jvp(stencils, e, fits.chart[e], dot.chart[e]));
@@ -134,7 +133,7 @@ void bending_jvp(const BendingStencils& stencils,
   const std::vector<double> c = curvature_operator(stencils, fits);
   dot.curvature_operator = curvature_operator_jvp(stencils, fits, change);
   for (Index e = 0; e < stencils.size(); ++e) {
-    const std::span<const Index> vertices = stencils.element(e);
+    const std::span<const Index> vertices = stencils.rest_element(e);
     const auto size = static_cast<Index>(vertices.size());
     const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
     const ConstOperatorMap c_e(c.data() + offset, 3, size);
@@ -142,6 +141,7 @@ void bending_jvp(const BendingStencils& stencils,
     const Mat3 frame_dot = Eigen::Map<const Mat3>(change.chart[e].frame.data());
     const bool patch = stencils.model[e] == BendingModel::kPatch;
     dot.bending_area[e] = patch ? area_change(fits.chart[e], change.chart[e]) : 0.0;
+    if (stencils.sewn[e] != 0) continue;
     dot.curvature[e] =
         frame_dot.transpose() * second_derivatives(vertices, c_e, X) +
         fits.chart[e].frame().transpose() *
@@ -158,8 +158,9 @@ RestShapeBar rest_shape_jvp(const Topology& topology,
   RestShapeBar dot(topology, stencils);
   for (std::size_t f = 0; f < topology.faces.size(); ++f) {
     const std::array<Index, 3>& face = topology.faces[f];
-    const Chart local = chart(face, {}, X);
-    const ChartBar change = chart_jvp(face, {}, local, X, X_dot);
+    const std::array<Unfolding, 3> points = base_points(topology.rest_faces[f]);
+    const Chart local = chart(points, X);
+    const ChartBar change = chart_jvp(points, local, X, X_dot);
     const std::array<Dual1, 3> base = dual_base(local, change);
     const std::array<Dual1, 6> g = shape_gradient(base[0], base[1], base[2]);
     for (int k = 0; k < 6; ++k) dot.shape_gradient[f](k / 2, k % 2) = change_of(g[k]);
@@ -171,8 +172,10 @@ RestShapeBar rest_shape_jvp(const Topology& topology,
   }
   bending_jvp(stencils, X, X_dot, dot);
   for (std::size_t e = 0; e < topology.edges.size(); ++e) {
-    const auto [v0, v1] = topology.edges[e];
-    dot.edge_length_sq[e] = 2.0 * (row(X, v1) - row(X, v0)).dot(row(X_dot, v1) - row(X_dot, v0));
+    for_each_rest_edge(topology, e, [&](Index v0, Index v1, double share) {
+      dot.edge_length_sq[e] +=
+          2.0 * share * (row(X, v1) - row(X, v0)).dot(row(X_dot, v1) - row(X_dot, v0));
+    });
   }
   return dot;
 }

@@ -37,13 +37,15 @@ class Patch {
   Patch(const Topology& topology, Index face)
       : topology_(&topology),
         vertices_(topology.faces[face].begin(), topology.faces[face].end()),
-        unfold_edge_(3, {-1, -1}),
-        faces_{{.face = face, .corner = {0, 1, 2}}} {}
+        faces_{{.face = face, .corner = {0, 1, 2}}} {
+    const std::array<Unfolding, 3> corners = base_points(topology.rest_faces[face]);
+    unfoldings_.assign(corners.begin(), corners.end());
+  }
 
   const std::vector<Index>& vertices() const { return vertices_; }
-  const std::vector<std::array<Index, 2>>& unfold_edge() const { return unfold_edge_; }
+  const std::vector<Unfolding>& unfoldings() const { return unfoldings_; }
 
-  Chart chart(const double* X) const { return mesh::chart(vertices_, unfold_edge_, X); }
+  Chart chart(const double* X) const { return mesh::chart(unfoldings_, X); }
 
   /// Add the face beyond the side opposite corner p of the base face, if there is one.
   void add_across(Index p) { add_beyond(0, topology_->face_edges[faces_[0].face][p]); }
@@ -83,22 +85,27 @@ class Patch {
     const Index j = place(v);
     if (j == static_cast<Index>(vertices_.size())) {
       vertices_.push_back(v);
-      unfold_edge_.push_back({a, b});
+      const auto rest = [&](Index vertex) {
+        const auto corner = std::ranges::find(topology_->faces[beyond], vertex);
+        return topology_->rest_faces[beyond][corner - topology_->faces[beyond].begin()];
+      };
+      unfoldings_.push_back(
+          {.edge = {a, b}, .rest = {rest(vertices_[a]), rest(vertices_[b]), rest(v)}});
     }
     faces_.push_back({.face = beyond, .corner = {b, a, j}});
   }
 
   const Topology* topology_;
   std::vector<Index> vertices_;
-  std::vector<std::array<Index, 2>> unfold_edge_;
+  std::vector<Unfolding> unfoldings_;
   std::vector<Unfolded> faces_;
 };
 
 void append_chart(const Patch& patch, BendingStencils& stencils) {
   stencils.chart_points.insert(stencils.chart_points.end(), patch.vertices().begin(),
                                patch.vertices().end());
-  stencils.unfold_edge.insert(stencils.unfold_edge.end(), patch.unfold_edge().begin(),
-                              patch.unfold_edge().end());
+  stencils.unfoldings.insert(stencils.unfoldings.end(), patch.unfoldings().begin(),
+                             patch.unfoldings().end());
   stencils.chart_start.push_back(static_cast<Index>(stencils.chart_points.size()));
 }
 
@@ -171,21 +178,55 @@ Patch side_patch(const Topology& topology, Index face, Index corner, const doubl
   return better ? second : first;
 }
 
+/// Vertices of an element, and their rest vertices in its charts.
+class ElementPoints {
+ public:
+  void add(const BendingStencils& stencils, Index chart) {
+    const std::span<const Index> points = stencils.points(chart);
+    const std::span<const Unfolding> unfolding = stencils.unfolding(chart);
+    for (Index j = 0; j < static_cast<Index>(points.size()); ++j) {
+      const auto [a, b] = unfolding[j].edge;
+      const std::array<Index, 3> local =
+          j < 3 ? std::array<Index, 3>{0, 1, 2} : std::array{a, b, j};
+      for (int p = 0; p < 3; ++p) add(points[local[p]], unfolding[j].rest[p]);
+    }
+  }
+
+  const std::vector<Index>& vertices() const { return vertices_; }
+  const std::vector<Index>& rest_vertices() const { return rest_vertices_; }
+  /// True if a vertex has several rest vertices.
+  bool sewn() const { return sewn_; }
+
+ private:
+  void add(Index vertex, Index rest_vertex) {
+    const auto found = std::ranges::find(vertices_, vertex);
+    if (found == vertices_.end()) {
+      vertices_.push_back(vertex);
+      rest_vertices_.push_back(rest_vertex);
+    } else if (rest_vertices_[found - vertices_.begin()] != rest_vertex) {
+      sewn_ = true;
+    }
+  }
+
+  std::vector<Index> vertices_, rest_vertices_;
+  bool sewn_ = false;
+};
+
 /// Collect the vertices of elements: the points of their own quadratic and of their fitted sides.
 void gather_vertices(BendingStencils& stencils) {
-  std::vector<std::vector<Index>> elements(stencils.size());
+  std::vector<ElementPoints> elements(stencils.size());
   for (Index e = 0; e < stencils.size(); ++e) {
-    const std::span<const Index> points = stencils.points(e);
-    elements[e].assign(points.begin(), points.end());
+    elements[e].add(stencils, e);
   }
   for_each_element_side(stencils, [&](const ElementSide& part) {
-    std::vector<Index>& element = elements[part.element];
-    for (const Index v : stencils.points(stencils.side_chart(part.side))) {
-      if (std::ranges::find(element, v) == element.end()) element.push_back(v);
-    }
+    elements[part.element].add(stencils, stencils.side_chart(part.side));
   });
-  for (const std::vector<Index>& element : elements) {
-    stencils.vertices.insert(stencils.vertices.end(), element.begin(), element.end());
+  for (const ElementPoints& element : elements) {
+    stencils.vertices.insert(stencils.vertices.end(), element.vertices().begin(),
+                             element.vertices().end());
+    stencils.rest_vertices.insert(stencils.rest_vertices.end(), element.rest_vertices().begin(),
+                                  element.rest_vertices().end());
+    stencils.sewn.push_back(element.sewn() ? 1 : 0);
     stencils.start.push_back(static_cast<Index>(stencils.vertices.size()));
   }
 }

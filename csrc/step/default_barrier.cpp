@@ -41,6 +41,19 @@ std::vector<double> take_out_long_springs(const Scene& scene,
   return traces;
 }
 
+/// Rest positions with which the cloths' embedding is at rest, also at seams [3 M].
+std::vector<double> rest_positions_of_embedding(const Scene& scene) {
+  std::vector<double> X(scene.given.rest_positions.size());
+  const mesh::Topology& topology = scene.topology;
+  for (std::size_t f = 0; f < topology.faces.size(); ++f) {
+    for (int p = 0; p < 3; ++p) {
+      Eigen::Map<Vec3>(X.data() + 3 * topology.rest_faces[f][p]) =
+          row(scene.given.rest_embedding.data(), topology.faces[f][p]);
+    }
+  }
+  return X;
+}
+
 /// kappa = c d_hat mean(H_ii) / (eta w_mean) of each cloth, c = 5; eta = d_hat b''(gap) at a gap of
 /// d_hat / 2 between surfaces as thick as the cloth.
 std::vector<double> stiffness_of_cloths(const Scene& scene,
@@ -50,8 +63,14 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
   std::vector<double> result;
   if (scene.cloth_count() == 0) return result;
   Inputs at_rest = inputs;
-  at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
-      scene.given.rest_positions.data();
+  const std::vector<double>& embedding = scene.given.rest_embedding;
+  at_rest.views[static_cast<std::size_t>(Input::kPositions)].data = embedding.data();
+  std::vector<double> X;
+  if (embedding != scene.given.rest_positions) {
+    X = rest_positions_of_embedding(scene);
+    at_rest.views[static_cast<std::size_t>(Input::kRestPositions)] = {.data = X.data(),
+                                                                      .count = X.size()};
+  }
   const double* const given_weights = inputs.data(Input::kSpringWeights);
   std::vector<double> weights(given_weights,
                               given_weights + scene.given.attachments.rest_length.size());
@@ -60,7 +79,7 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
     at_rest.views[static_cast<std::size_t>(Input::kSpringWeights)].data = weights.data();
   Problem p(scene, at_rest);
   std::vector<double> x = p.start;  // bodies included
-  std::copy_n(scene.given.rest_positions.data(), p.cloth_size, x.begin());
+  std::copy_n(embedding.data(), p.cloth_size, x.begin());
   const linalg::BlockMatrix hessian = contact_free_hessian(p, x.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
   const double* thickness = inputs.data(Input::kThickness);

@@ -54,25 +54,26 @@ enum class Input : std::uint8_t {
   kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
 
-/// Extent of an input: the entities that have one value each. N vertices, F faces and C cloths; T trees
-/// and n coordinates of mechanisms; S surfaces.
+/// Extent of an input: the entities that have one value each. N vertices, M rest vertices, F faces and C
+/// cloths; T trees and n coordinates of mechanisms; S surfaces.
 enum class Extent : std::uint8_t {
-  kOne,          ///< []
-  kVector,       ///< [3]
-  kVertices,     ///< [N, 3]
-  kAllVertices,  ///< [N + V, 3], with the vertices of bodies and links
-  kPins,         ///< [P, 3]
-  kSoftPins,     ///< [Q, 3]
-  kAttachments,  ///< [A]
-  kTargets,      ///< [U, 3], of attachments to targets
-  kPerFace,      ///< one value, one a cloth or one a face
-  kPerCloth,     ///< one value or one a cloth
-  kTrees,        ///< [T, 7]
-  kSurfaces,     ///< [S]
-  kPairs,        ///< one value or [S, S]
-  kCoordinates,  ///< [n]
-  kJointTerms,   ///< [n, 7]
-  kBlocks,       ///< [sum n_t^2], tree after tree
+  kOne,           ///< []
+  kVector,        ///< [3]
+  kVertices,      ///< [N, 3]
+  kRestVertices,  ///< [M, 3]
+  kAllVertices,   ///< [N + V, 3], with the vertices of bodies and links
+  kPins,          ///< [P, 3]
+  kSoftPins,      ///< [Q, 3]
+  kAttachments,   ///< [A]
+  kTargets,       ///< [U, 3], of attachments to targets
+  kPerFace,       ///< one value, one a cloth or one a face
+  kPerCloth,      ///< one value or one a cloth
+  kTrees,         ///< [T, 7]
+  kSurfaces,      ///< [S]
+  kPairs,         ///< one value or [S, S]
+  kCoordinates,   ///< [n]
+  kJointTerms,    ///< [n, 7]
+  kBlocks,        ///< [sum n_t^2], tree after tree
 };
 
 /// Condition under which a step needs an input; otherwise the input may be absent.
@@ -126,7 +127,7 @@ inline constexpr std::array kInputTable{
     InputRow{Input::kSpringTargets, "attachment_targets", Extent::kTargets},
     InputRow{Input::kSpringWeights, "attachment_weights", Extent::kAttachments},
     InputRow{Input::kSpringStiffness, "attachment_stiffness", Extent::kAttachments},
-    InputRow{Input::kRestPositions, "rest_positions", Extent::kVertices, Need::kNowhere},
+    InputRow{Input::kRestPositions, "rest_positions", Extent::kRestVertices, Need::kNowhere},
     InputRow{Input::kNormalDrag, "normal_drag", Extent::kPerFace},
     InputRow{Input::kTangentialDrag, "tangential_drag", Extent::kPerFace},
     InputRow{Input::kAirDensity, "air_density", Extent::kOne, Need::kCloths},

@@ -55,9 +55,9 @@ std::vector<double> reference_positions(const Description& d) {
   return x;
 }
 
-/// All surfaces at rest, bodies in their own frames.
-std::vector<double> all_rest_positions(const Description& d) {
-  std::vector<double> x = d.rest_positions;
+/// All surfaces at rest in space, bodies in their own frames.
+std::vector<double> all_at_rest(const Description& d) {
+  std::vector<double> x = d.rest_embedding;
   x.insert(x.end(), d.bodies.vertices.begin(), d.bodies.vertices.end());
   return x;
 }
@@ -171,8 +171,8 @@ std::vector<projective::FaceSearch> face_searches(const Description& d) {
 /// Spheres half as large as the shortest edge at their vertex at rest; the two spheres of an edge never touch.
 projective::VertexSpheres make_vertex_spheres(const Description& d,
                                               const contact::CollisionMesh& mesh) {
-  const double* const X = d.rest_positions.data();
-  const std::size_t n = d.rest_positions.size() / 3;
+  const double* const X = d.rest_embedding.data();
+  const std::size_t n = d.rest_embedding.size() / 3;
   projective::VertexSpheres spheres;
   spheres.radius.assign(n, std::numeric_limits<double>::infinity());
   spheres.apart.resize(n);
@@ -246,7 +246,10 @@ std::vector<bodies::Mechanisms::FreeBody> find_free_bodies(const Description& d,
 
 Scene::Scene(Description description)
     : given(std::move(description)),
-      topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
+      topology(static_cast<Index>(given.vertices.size() / 3),
+               given.faces,
+               static_cast<Index>(given.rest_positions.size() / 3),
+               given.rest_faces),
       face_cloth(owners(given.cloth_face_start)),
       material_axes(vectors(given.material_axes)),
       vertex_cloth(owners(given.cloth_vertex_start)),
@@ -257,8 +260,8 @@ Scene::Scene(Description description)
       free_bodies(find_free_bodies(given, mechanisms, collision_mesh)),
       mean_edge(mean_length(rest, collision_mesh, given.bodies)),
       prescribed(make_prescribed(given, mechanisms)),
-      measures(contact::measure(collision_mesh, all_rest_positions(given).data())),
-      feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
+      measures(contact::measure(collision_mesh, all_at_rest(given).data())),
+      feature_weights(collision_mesh, all_at_rest(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
       face_search(face_searches(given)),
       vertex_spheres(scheme().has_barrier ? projective::VertexSpheres()

@@ -96,8 +96,11 @@ struct AttachmentDescription {
 /// Description of a scene and its options: the arguments of a simulator.
 struct Description {
   std::vector<double> vertices;        ///< [3 N] initial positions [m]
-  std::vector<double> rest_positions;  ///< [3 N] rest positions [m]
+  std::vector<double> rest_positions;  ///< [3 M] of the vertices of the rest mesh [m]
+  /// [3 N] cloths at rest as they may be in space [m]: without seams the rest positions, else nearly
+  std::vector<double> rest_embedding;
   std::vector<std::array<Index, 3>> faces;
+  std::vector<std::array<Index, 3>> rest_faces;    ///< [F] see mesh::Topology
   std::vector<Index> cloth_vertex_start;           ///< [C + 1]
   std::vector<Index> cloth_face_start;             ///< [C + 1]
   std::vector<mesh::BendingModel> bending_models;  ///< [C]
@@ -132,6 +135,7 @@ struct Scene {
   explicit Scene(Description description);
 
   Index cloth_vertex_count() const { return topology.vertex_count; }
+  Index rest_vertex_count() const { return topology.rest_vertex_count; }
   Index vertex_count() const { return collision_mesh.vertex_count; }
   Index cloth_count() const { return static_cast<Index>(given.bending_models.size()); }
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
@@ -155,7 +159,7 @@ struct Scene {
       free_bodies;                          ///< bodies without springs; surfaces of the scene
   double mean_edge;                         ///< mean edge of cloths at rest, else of bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
-  contact::RestMeasures measures;           ///< measures of given.rest_positions and the bodies
+  contact::RestMeasures measures;           ///< measures of given.rest_embedding and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] those that nodes touch

@@ -26,10 +26,11 @@ from diffcloth_torch.config.schema import RunConfig, SimulationSection
 from diffcloth_torch.config.section import Section
 from diffcloth_torch.config.shape_schema import PoseSection
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.meshes import read_file_mesh, read_mesh
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import interpolate_poses
 from diffcloth_torch.geometry.shapes import strip
+from diffcloth_torch.geometry.texture import flat_rest_mesh
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -103,6 +104,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     shape = section.shape
     rest: NDArray[np.float64]
     faces: NDArray[np.integer[Any]]
+    rest_faces: NDArray[np.integer[Any]] | None = None
     if shape.kind == "grid":
         sheet = Cloth.grid((shape.columns, shape.rows), shape.size)
         rest, faces = sheet.vertices, sheet.faces
@@ -112,13 +114,14 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     elif shape.kind == "strip":
         rest, start, faces = _generated(section.name, strip, _given(shape))
     else:
-        start, faces = read_mesh(resolve_path(source, root, shape.path), f"{section.name}: `path`")
+        path = resolve_path(source, root, shape.path)
+        start, faces, texture = read_file_mesh(path, f"{section.name}: `path`")
         start = rest = shape.scale * start
-        if shape.rest is not None:
-            rest = (
-                shape.scale
-                * read_mesh(resolve_path(source, root, shape.rest), f"{section.name}: `rest`")[0]
-            )
+        if shape.rest == "uv" and shape.rest_scale is not None:
+            rest, rest_faces = flat_rest_mesh(f"{path}", faces, texture, shape.rest_scale)
+        elif shape.rest is not None:
+            other = resolve_path(source, root, shape.rest)
+            rest = shape.scale * read_mesh(other, f"{section.name}: `rest`")[0]
     vertices = transform(start, pose_array(section.pose))
     options: dict[str, Any] = section.model_dump(
         include={"pin_stiffness", "bending_model", "directions"}, exclude_none=True
@@ -133,6 +136,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
         faces,
         material=_material(section.material),
         rest_positions=rest,
+        rest_faces=rest_faces,
         name=section.name,
         **options,
     )

@@ -86,9 +86,19 @@ class MeshFile(Section):
 
 
 class ClothFile(MeshFile):
-    """A mesh file of a cloth, and optionally another one of its stress-free shape."""
+    """A mesh file of a cloth, and optionally another one of its stress-free shape.
+
+    With "uv" the texture of the file is the stress-free shape, at `rest_scale` meters per unit.
+    """
 
     rest: str | None = None
+    rest_scale: Positive | None = None
+
+    @model_validator(mode="after")
+    def _check_rest(self) -> ClothFile:
+        if (self.rest == "uv") != (self.rest_scale is not None):
+            raise ValueError("must give `rest_scale` with `rest: uv`, and only with it")
+        return self
 
 
 class Grid(Section):

@@ -131,6 +131,7 @@ def with_material(cloth: Cloth, material: Material | None) -> Cloth:
         soft_pins=dict(cloth.soft_pins),
         pin_stiffness=cloth.pin_stiffness,
         rest_positions=cloth.rest_positions,
+        rest_faces=cloth.rest_faces,
         bending_model=cloth.bending_model,
         name=cloth.name,
         directions=cloth.directions if material.is_orthotropic else None,

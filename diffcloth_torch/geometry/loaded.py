@@ -16,7 +16,7 @@ from diffcloth_torch.checks import (
     check_number,
     frozen,
 )
-from diffcloth_torch.errors import InvalidInput, warn_caller
+from diffcloth_torch.errors import warn_caller
 from diffcloth_torch.geometry.meshes import FileMesh, Indices, read_file_mesh
 from diffcloth_torch.geometry.polygons import welded
 
@@ -45,47 +45,6 @@ class LoadedMesh(NamedTuple):
     faces: Indices
     texture: FloatArray | None
     file_vertices: IndexArray
-
-    def flat_rest_shape(self, owner: str, scale: float) -> FloatArray:
-        """Vertices [n, 3] in the plane of the texture coordinates.
-
-        Args:
-            owner: Prefix of messages.
-            scale: Meters per unit of the texture coordinates.
-
-        Raises:
-            InvalidInput: If a corner has no texture coordinates, a vertex has several, or faces
-                overlap because some are mirrored.
-        """
-        given = np.full((*self.faces.shape, 2), np.nan) if self.texture is None else self.texture
-        missing = np.isnan(given).any(axis=(1, 2))
-        if missing.any():
-            raise InvalidInput(
-                f"{owner}: `rest` 'uv' needs an .obj file with texture coordinates at all corners; "
-                f"face {int(np.argmax(missing))} has none ({int(missing.sum())} of {len(given)})"
-            )
-        corners, coordinates = self.faces.reshape(-1), given.reshape(-1, 2)
-        flat = np.zeros((len(self.vertices), 3))
-        flat[corners, :2] = coordinates
-        other = (flat[corners, :2] != coordinates).any(axis=1)
-        if other.any():
-            split = np.unique(corners[other])
-            raise InvalidInput(
-                f"{owner}: `rest` 'uv' must have one place for each vertex, but {len(split)} have "
-                f"several, as vertex {split[0]}: a seam cuts the texture there; cut the mesh at "
-                "its seams, load the pieces and sew them with attachments"
-            )
-        a, b, c = (flat[self.faces[:, k], :2] for k in range(3))
-        (u0, v0), (u1, v1) = (b - a).T, (c - a).T
-        mirrored = u0 * v1 - u1 * v0 < 0.0
-        if mirrored.any() and not mirrored.all():
-            rare = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
-            raise InvalidInput(
-                f"{owner}: `rest` 'uv' must have faces that all turn one way, but face "
-                f"{int(np.argmax(rare))} is mirrored ({int(rare.sum())} of {len(rare)}): the "
-                "texture is folded there"
-            )
-        return scale * flat
 
 
 def load_mesh(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray, IndexArray
+from diffcloth_torch.geometry.mesh_checks import Surface
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.rigid_body import Primitive, RigidBody
 from diffcloth_torch.model.scene import Scene
@@ -34,11 +35,14 @@ class Assembly:
 
     Attributes:
         vertices: Initial cloth positions [m], shape [N, 3].
-        rest_positions: Stress-free cloth positions [m], shape [N, 3].
+        rest_positions: Vertices of the rest meshes of the cloths [m], shape [M, 3].
+        rest_embedding: Vertices of the cloths at rest in space [m], shape [N, 3]; see `Cloth`.
         faces: Cloth faces, indices into `vertices`, shape [F, 3].
+        rest_faces: The same faces in the rest meshes, indices into `rest_positions`, shape [F, 3].
         material_axes: Unit vector of the warp in the rest frame of each face, shape [F, 2]; empty
             if no cloth is woven.
         cloth_vertex_start: First vertex of each cloth, then N; shape [C + 1].
+        cloth_rest_start: First rest vertex of each cloth, then M; shape [C + 1].
         cloth_face_start: First face of each cloth, then F; shape [C + 1].
         deforming_count: Number of deforming bodies, which are the last cloths.
         pins: Pinned vertices, without the vertices of deforming bodies; shape [P].
@@ -78,9 +82,12 @@ class Assembly:
 
     vertices: FloatArray
     rest_positions: FloatArray
+    rest_embedding: FloatArray
     faces: IndexArray
+    rest_faces: IndexArray
     material_axes: FloatArray
     cloth_vertex_start: IndexArray
+    cloth_rest_start: IndexArray
     cloth_face_start: IndexArray
     deforming_count: int
     pins: IndexArray
@@ -118,6 +125,7 @@ class Assembly:
         """Sizes by their letters in the tables of quantities."""
         return {
             "N": len(self.vertices),
+            "M": len(self.rest_positions),
             "F": len(self.faces),
             "C": self.cloth_count,
             "K": self.body_count,
@@ -187,6 +195,9 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         all_nodal: Whether cloths touch all bodies at their vertices, even without `nodal_contact`.
     """
     vertices, faces, vertex_start, face_start = _concatenate(scene.cloths)
+    rest_positions, rest_faces, rest_start, _ = _concatenate(
+        [Surface(cloth.rest_positions, cloth.rest_faces) for cloth in scene.cloths]
+    )
     links = [
         (len(scene.bodies) + r, link, surface)
         for r, robot in enumerate(scene.robots)
@@ -207,12 +218,15 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
     joint_positions = _joined(robot.joint_positions for robot in scene.robots)
     return Assembly(
         vertices=vertices,
-        rest_positions=np.concatenate(
-            [np.empty((0, 3)), *(cloth.rest_positions for cloth in scene.cloths)]
+        rest_positions=rest_positions,
+        rest_embedding=np.concatenate(
+            [np.empty((0, 3)), *(cloth.rest_embedding for cloth in scene.cloths)]
         ),
         faces=faces,
+        rest_faces=rest_faces,
         material_axes=_material_axes(scene),
         cloth_vertex_start=vertex_start,
+        cloth_rest_start=rest_start,
         cloth_face_start=face_start,
         deforming_count=len(scene.deforming_bodies),
         pins=pins,

@@ -30,6 +30,7 @@ from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.loaded import load_mesh
 from diffcloth_torch.geometry.mesh_checks import check_areas, check_manifold, surface_arrays
 from diffcloth_torch.geometry.poses import pose_array, transform
+from diffcloth_torch.geometry.texture import flat_rest_mesh
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.orthotropy import material_axes
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
@@ -56,7 +57,10 @@ class Cloth:
         pins: Name -> indices of vertices whose motion is prescribed.
         soft_pins: Name -> indices of vertices that springs pull to targets.
         pin_stiffness: Stiffness of each of these springs [N/m].
-        rest_positions: Where the cloth is free of stress [m], shape [n, 3].
+        rest_positions: Vertices of the rest mesh, in which the cloth is free of stress [m], shape
+            [r, 3]; r = n without seams.
+        rest_faces: The faces in the rest mesh, indices into `rest_positions`, shape [f, 3]; `faces`
+            without seams.
         bending_model: "patch" (isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
         directions: Direction of the warp at rest, shape [3], or one per face, shape [f, 3].
@@ -71,6 +75,7 @@ class Cloth:
     soft_pins: Mapping[str, IndexArray]
     pin_stiffness: float
     rest_positions: FloatArray
+    rest_faces: IndexArray
     bending_model: str
     name: str | None
     directions: FloatArray
@@ -86,6 +91,7 @@ class Cloth:
         soft_pins: Mapping[str, ArrayLike] | None = None,
         pin_stiffness: float = 1e4,
         rest_positions: ArrayLike | None = None,
+        rest_faces: ArrayLike | None = None,
         bending_model: str = "patch",
         name: str | None = None,
         directions: ArrayLike | None = None,
@@ -100,7 +106,12 @@ class Cloth:
             pins: Name -> indices of vertices whose motion is prescribed.
             soft_pins: Name -> indices of vertices that springs pull to targets.
             pin_stiffness: Stiffness of each of these springs [N/m], > 0.
-            rest_positions: Stress-free positions [m], shape [n, 3]; `vertices` by default.
+            rest_positions: Stress-free positions [m], shape [n, 3], or [r, 3] with `rest_faces`;
+                `vertices` by default.
+            rest_faces: The faces in a rest mesh that is cut at seams, indices into
+                `rest_positions`, shape [f, 3]. Each face has its own triangle at rest, and a vertex
+                of a seam several rest vertices. Seams are sewn flat: the angle between the faces at
+                both sides is zero at rest. By default no seams.
             bending_model: "patch" or "hinge".
             name: Name in the scene.
             directions: Direction of the warp in the rest shape, shape [3] or [f, 3]; along x by
@@ -117,7 +128,7 @@ class Cloth:
         points, triangles = surface_arrays(owner, vertices, faces, instead=_POSITIONS)
         check_manifold(owner, len(points), triangles)
         # The rest shape does not depend on the pose, and unrotated coordinates are exact.
-        self.rest_positions = _rest(rest_positions, points, triangles)
+        self.rest_positions, self.rest_faces = _rest(rest_positions, rest_faces, points, triangles)
         if pose is not None:
             placement = pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS)
             points = frozen(transform(points, placement))
@@ -133,13 +144,36 @@ class Cloth:
         if self.bending_model == "hinge":
             _refuse_woven_hinges(self.material)
 
+    @property
+    def has_seams(self) -> bool:
+        """Whether the rest mesh is cut, so that some vertices have several rest vertices."""
+        return len(self.rest_positions) > len(self.vertices)
+
+    @property
+    def rest_embedding(self) -> FloatArray:
+        """Positions of the vertices at rest [m], shape [n, 3].
+
+        With seams no such positions may exist. Then they are those of `vertices`, scaled to the
+        area of the rest mesh.
+        """
+        if self.has_seams:
+            areas = (
+                _double_areas(self.rest_positions[self.rest_faces]).sum(),
+                _double_areas(self.vertices[self.faces]).sum(),
+            )
+            scaled: FloatArray = np.sqrt(areas[0] / areas[1]) * self.vertices
+            return scaled
+        embedding = np.empty_like(self.vertices)
+        embedding[self.faces] = self.rest_positions[self.rest_faces]
+        return embedding
+
     def material_axes(self, owner: str) -> FloatArray:
         """Unit vectors of the warp in the rest frames of the faces, shape [f, 2].
 
         Args:
             owner: Opens the message of the error where a direction is normal to a face.
         """
-        return material_axes(owner, self.directions, self.rest_positions, self.faces)
+        return material_axes(owner, self.directions, self.rest_positions, self.rest_faces)
 
     @classmethod
     def load(
@@ -162,8 +196,9 @@ class Cloth:
         Args:
             path: Mesh file.
             scale: Meters per unit of the file, > 0.
-            rest: "uv" takes the texture coordinates of an .obj file as rest shape, flat in the
-                xy-plane, with u along x. Each vertex must have one pair of them: no seam.
+            rest: "uv" takes the triangles of the texture of an .obj file as rest shape, flat in the
+                xy-plane, with u along x. The islands of the texture may lie anywhere, also mirrored
+                or on each other. Seams between them are sewn flat, as with `rest_faces`.
             rest_scale: Meters per unit of the texture coordinates, > 0; required for `rest`.
             triangulate: Whether to cut quads and other polygons into triangles, from their shorter
                 diagonals on, instead of refusing them.
@@ -185,15 +220,17 @@ class Cloth:
         )
         if rest is not None:
             check_choice("Cloth.load: `rest`", rest, ("uv",))
-            if keywords.get("rest_positions") is not None:
-                raise InvalidInput("Cloth.load: `rest` must be None beside `rest_positions`")
+            for field in ("rest_positions", "rest_faces"):
+                if keywords.get(field) is not None:
+                    raise InvalidInput(f"Cloth.load: `rest` must be None beside `{field}`")
             if rest_scale is None:
                 raise InvalidInput(
                     "Cloth.load: `rest_scale` must be given with `rest`: the meters per unit of "
                     "the texture coordinates"
                 )
             size = check_number("Cloth.load: `rest_scale`", rest_scale, POSITIVE, instead=_REST)
-            keywords = {**keywords, "rest_positions": mesh.flat_rest_shape(f"{path}", size)}
+            flat = flat_rest_mesh(f"{path}", mesh.faces, mesh.texture, size)
+            keywords |= {"rest_positions": flat.positions, "rest_faces": flat.faces}
         elif rest_scale is not None:
             raise InvalidInput("Cloth.load: `rest_scale` must be None without `rest`")
         cloth = cls(mesh.vertices, mesh.faces, **keywords)
@@ -234,10 +271,13 @@ class Cloth:
 
     def __getstate__(self) -> dict[str, Any]:
         plain = {"pins": dict(self.pins), "soft_pins": dict(self.soft_pins)}
-        return {**vars(self), **plain}
+        fields = {**vars(self), **plain}
+        if self.rest_faces is self.faces:
+            del fields["rest_faces"]
+        return fields
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        self.__dict__.update({"rest_faces": state["faces"], **state})
         self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
 
 
@@ -303,16 +343,53 @@ def plane_size(name: str, size: object) -> FloatArray:
     return np.broadcast_to(lengths, 2)
 
 
-def _rest(given: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Check the rest shape."""
+def _rest(
+    given: object, given_faces: object, vertices: FloatArray, faces: IndexArray
+) -> tuple[FloatArray, IndexArray]:
+    """Check the rest mesh."""
     if given is None:
-        return vertices
+        if given_faces is not None:
+            raise InvalidInput("Cloth: `rest_faces` must be None without `rest_positions`")
+        return vertices, faces
     rest = float_array("Cloth: `rest_positions`", given, instead=_REST)
-    check_shape("Cloth: `rest_positions`", rest.shape, [vertices.shape])
+    shape = vertices.shape if given_faces is None else ("r", 3)
+    check_shape("Cloth: `rest_positions`", rest.shape, [shape])
     check_finite("Cloth: `rest_positions`", rest)
-    check_areas("Cloth", "rest_positions", rest, faces)
+    rest_faces = faces if given_faces is None else _rest_faces(given_faces, len(rest), faces)
+    check_areas("Cloth", "rest_positions", rest, rest_faces)
     frozen(rest)
-    return rest
+    return rest, rest_faces
+
+
+def _rest_faces(given: object, rest_count: int, faces: IndexArray) -> IndexArray:
+    """Check the faces of the rest mesh; returns `faces` themselves if they are equal."""
+    name = "Cloth: `rest_faces`"
+    rest_faces = index_array(name, given, rest_count)
+    check_shape(name, rest_faces.shape, [faces.shape])
+    owner = np.full(rest_count, -1)
+    owner[rest_faces] = faces
+    if (owner < 0).any():
+        unused = int(np.argmax(owner < 0))
+        raise InvalidInput(
+            f"{name} must name each rest vertex; {unused} is not named "
+            f"({int((owner < 0).sum())} in all)"
+        )
+    other = np.argwhere(owner[rest_faces] != faces)
+    if len(other):
+        face, corner = other[0].tolist()
+        vertex = int(rest_faces[face, corner])
+        raise InvalidInput(
+            f"{name} must give each rest vertex one vertex, got {vertex} for the vertices "
+            f"{faces[face, corner]} and {owner[vertex]}, at [{face}, {corner}]"
+        )
+    return faces if np.array_equal(rest_faces, faces) else frozen(rest_faces)
+
+
+def _double_areas(triangles: FloatArray) -> FloatArray:
+    """Twice the areas of triangles [f, 3, 3]."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    areas: FloatArray = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
 
 
 def _material(material: object, face_count: int) -> Material:

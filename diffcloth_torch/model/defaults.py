@@ -155,7 +155,9 @@ def choose_barrier_distance(
             "Simulator: `contact.barrier_distance` must be given for a scene without cloths"
         )
     edges = [
-        np.linalg.norm(np.diff(cloth.rest_positions[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
+        np.linalg.norm(
+            np.diff(cloth.rest_positions[unique_edges(cloth.rest_faces)[0]], axis=1), axis=-1
+        )
         for cloth in _elastic(scene)
     ]
     distance = _PART_OF_EDGE * float(np.median(np.concatenate(edges)))
@@ -183,7 +185,7 @@ def _refuse_coincident(scene: Scene) -> None:
     """Refuse cloths with two vertices at one place: two cut edges instead of a seam."""
     for name, cloth in zip(scene.cloth_names, _elastic(scene), strict=False):
         _, first, inverse = np.unique(
-            cloth.rest_positions, axis=0, return_index=True, return_inverse=True
+            cloth.rest_embedding, axis=0, return_index=True, return_inverse=True
         )
         twins = np.flatnonzero(first[inverse.reshape(-1)] != np.arange(len(inverse.reshape(-1))))
         if len(twins):

@@ -148,7 +148,7 @@ _TAKEN_BY_THE_CORE = (
     Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE, stores=False),
     Quantity("pin_stiffness", "N/m", ((), ("C",)), "Cloth.pin_stiffness", POSITIVE),
     Quantity("gravity", "m/s^2", ((3,),), "Scene.gravity", stores=False),
-    Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_positions"),
+    Quantity("rest_positions", "m", (("M", 3),), "Cloth.rest_positions"),
     Quantity("attachment_stiffness", "N/m", (("A",),), "Attachment.stiffness", POSITIVE),
     Quantity(
         "normal_drag",

@@ -309,7 +309,13 @@ def _same_points(
     """Vertices of another mesh at the same material points, by their rest positions."""
     from scipy.spatial import cKDTree
 
-    mine, theirs = (np.asarray(t.scene.cloths[0].rest_positions) for t in (task, other))
+    cloths = [t.scene.cloths[0] for t in (task, other)]
+    if any(cloth.has_seams for cloth in cloths):
+        raise InvalidInput(
+            f"{where} must have cloths whose rest meshes have no seams, where each vertex has one "
+            "place at rest"
+        )
+    mine, theirs = (cloth.rest_embedding for cloth in cloths)
     distances, rows = cKDTree(theirs).query(mine[vertices])
     if distances.max() > _SAME_POINT * float(np.ptp(mine, axis=0).max()):
         raise InvalidInput(

@@ -256,7 +256,12 @@ class ReachShape(Reach):
         super().__init__(config, source)
         section = config.target
         cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
-        target = transform(cloth.rest_positions, pose_array(section.pose))
+        if cloth.has_seams:
+            raise InvalidInput(
+                f"target.cloth must have a rest mesh without seams, which has one shape in space; "
+                f"{section.cloth!r} has seams"
+            )
+        target = transform(cloth.rest_embedding, pose_array(section.pose))
         self._rows = self.simulator.slices[section.cloth]
         self._target = torch.from_numpy(target)
         self._goal = Goal(target, cloth.faces)

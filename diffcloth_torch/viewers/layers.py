@@ -31,7 +31,7 @@ def strain(cloths: Sequence[Cloth], positions: FloatArray) -> FloatArray:
     found, first = [], 0
     for cloth in cloths:
         rows = slice(first, first := first + len(cloth.vertices))
-        X, x = cloth.rest_positions[cloth.faces], positions[rows][cloth.faces]
+        X, x = cloth.rest_positions[cloth.rest_faces], positions[rows][cloth.faces]
         rest, now = np.diff(X, axis=1), np.diff(x, axis=1)  # two edges of each face, [f, 2, 3]
         # With the edges of the rest shape as columns Q R, the deformed edges are F Q R, and F Q is
         # of shape 3 x 2.

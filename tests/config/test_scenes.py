@@ -72,6 +72,31 @@ def test_own_meshes_keep_their_order_and_scale(tmp_path):
     assert cloth.vertices.tolist() == [[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [0.5, 0.5, 1]]
 
 
+UV = """v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0
+vt 0 0\nvt 1 0\nvt 0 1\nvt 3 3\nvt 3 2\nvt 4 2
+f 1/1 2/2 3/3\nf 2/4 4/5 3/6\n"""
+POSED = ["scene.cloths.sheet.pins={}", "scene.cloths.sheet.pose={position: [0, 0, 1]}"]
+
+
+def test_the_texture_of_a_file_is_a_rest_shape(tmp_path):
+    (tmp_path / "m.obj").write_text(UV)
+    shape = (
+        "scene.cloths.sheet.shape={kind: load, path: m.obj, scale: 0.5, rest: uv, rest_scale: 2}"
+    )
+    task = load_task(write_config(tmp_path, SHEET), [shape, *POSED])
+    (cloth,) = task.scene.cloths
+    assert cloth.vertices[3].tolist() == [0.5, 0.5, 1]
+    assert len(cloth.rest_positions) == 6
+    corners = cloth.rest_positions[cloth.rest_faces[1]]
+    np.testing.assert_array_equal(corners, [[6, 6, 0], [6, 4, 0], [8, 4, 0]])
+    loaded = dc.Cloth.load(tmp_path / "m.obj", scale=0.5, rest="uv", rest_scale=2.0)
+    np.testing.assert_array_equal(cloth.rest_positions, loaded.rest_positions)
+    for wrong in ("rest: uv", "rest_scale: 2", "rest: other.obj, rest_scale: 2"):
+        given = f"scene.cloths.sheet.shape={{kind: load, path: m.obj, {wrong}}}"
+        with pytest.raises(dc.InvalidInput, match="`rest_scale` with `rest: uv`, and only with it"):
+            load_task(write_config(tmp_path, SHEET), [given, *POSED])
+
+
 def test_pins_follow_their_keyframes(tmp_path):
     frames = "{top: [{time: 0.02, displacement: [0, 0.1, 0], axis: [0, 0, 1], degrees: 180}]}"
     task = load_task(

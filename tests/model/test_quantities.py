@@ -105,7 +105,7 @@ def test_the_core_gets_no_other_names(sim):
 
 def test_shapes_are_those_of_the_tables(sim):
     sizes = assemble(sim.scene).sizes
-    cloth = {"N": 16, "F": 14, "C": 2, "P": 1, "Q": 1, "D": 0}
+    cloth = {"N": 16, "M": 16, "F": 14, "C": 2, "P": 1, "Q": 1, "D": 0}
     assert sizes == {**cloth, "K": 2, "V": 5 * 8, "S": 7, "J": 2, "L": 3, "R": 1, "A": 3, "U": 2}
     state, parameters = sim.initial_state(), sim.default_parameters()
     for record, table in ((state, STATE), (parameters, PARAMETERS)):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from short_tasks import CONFIGS, SMALL, controls_of
+from short_tasks import CONFIGS, SMALL, controls_of, write_config
 
 import diffcloth_torch as dc
 from diffcloth_torch.tasks.optimization import evaluate, optimize
@@ -70,6 +70,20 @@ def test_the_wrong_number_of_action_rows_is_refused():
 def test_references_must_fit_the_scene(assignment, message):
     with pytest.raises(dc.InvalidInput, match=message):
         small_hit(assignment)
+
+
+def test_a_target_shape_has_no_seams(tmp_path):
+    path = tmp_path / "sewn.obj"
+    path.write_text(
+        "v -.5 0 0\nv .5 0 0\nv -.5 1 0\nv .5 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvt 3 3\nvt 3 2\n"
+        "vt 4 2\nf 1/1 2/2 3/3\nf 2/4 4/5 3/6\n"
+    )
+    shape = "{kind: load, path: sewn.obj, rest: uv, rest_scale: 1}"
+    with pytest.raises(dc.InvalidInput, match=r"target\.cloth must have a rest mesh without seams"):
+        load_task(
+            write_config(tmp_path, (CONFIGS / "hit_cloth.yaml").read_text(encoding="utf-8")),
+            [f"scene.cloths.sheet.shape={shape}", "scene.cloths.sheet.pins={}"],
+        )
 
 
 def test_the_distance_of_shapes_is_the_root_mean_square():

@@ -94,9 +94,16 @@ std::vector<mesh::BendingModel> model_list(const std::string& name, std::size_t 
 /// A rest mesh with its stencils and one elastic model on it, with all inputs that a test varies.
 class Elastic {
  public:
-  Elastic(const Positions& X, const Faces& faces, const std::string& bending_model)
+  /// @param rest_faces  the faces in the mesh of X; if absent, `faces`
+  Elastic(const Positions& X,
+          const Faces& faces,
+          const std::string& bending_model,
+          const std::optional<Faces>& rest_faces)
       : X_(X.data(), X.data() + X.size()),
-        topology_(static_cast<Index>(X.shape(0)), face_list(faces)),
+        topology_(vertex_count(X, faces, rest_faces),
+                  face_list(faces),
+                  static_cast<Index>(X.shape(0)),
+                  face_list(rest_faces ? *rest_faces : faces)),
         stencils_(
             mesh::choose_stencils(topology_, X_.data(), model_list(bending_model, faces.shape(0)))),
         pattern_(topology_.vertex_count, elastic::cliques(topology_, stencils_)),
@@ -111,7 +118,7 @@ class Elastic {
 
   /// Move the rest positions; the stencils stay.
   void set_rest(const Positions& X) {
-    check_rows("X", X.shape(0), topology_.vertex_count);
+    check_rows("X", X.shape(0), topology_.rest_vertex_count);
     std::copy(X.data(), X.data() + X.size(), X_.begin());
     rest_ = mesh::rest_shape(topology_, stencils_, X_.data());
   }
@@ -363,8 +370,8 @@ class Elastic {
 
   /// Sum of the cotangents of rest_vjp() times the changes of the fields along X_dot.
   double rest_jvp(const Positions& X_dot) const {
-    mesh::RestShapeBar dot =
-        mesh::rest_shape_jvp(topology_, stencils_, X_.data(), positions("X_dot", X_dot).data());
+    check_rows("X_dot", X_dot.shape(0), topology_.rest_vertex_count);
+    mesh::RestShapeBar dot = mesh::rest_shape_jvp(topology_, stencils_, X_.data(), X_dot.data());
     double total = 0.0;
     for_each_entry(dot, [&](double entry, std::size_t k) { total += std::cos(k + 1.0) * entry; });
     return total;
@@ -393,6 +400,13 @@ class Elastic {
   }
 
  private:
+  static Index vertex_count(const Positions& X,
+                            const Faces& faces,
+                            const std::optional<Faces>& rest_faces) {
+    if (!rest_faces) return static_cast<Index>(X.shape(0));
+    return *std::max_element(faces.data(), faces.data() + faces.size()) + 1;
+  }
+
   std::vector<double> positions(const char* name, const Positions& x) const {
     check_rows(name, x.shape(0), topology_.vertex_count);
     return {x.data(), x.data() + x.size()};
@@ -517,8 +531,10 @@ void elastic_kernels(nb::module_& m) {
   nb::class_<Elastic> model(m, "Elastic", "An elastic model on one rest mesh.");
   bind_potential(model);
   model
-      .def(nb::init<const Positions&, const Faces&, const std::string&>(), "X"_a.noconvert(),
-           "faces"_a.noconvert(), "bending_model"_a)
+      .def(nb::init<const Positions&, const Faces&, const std::string&,
+                    const std::optional<Faces>&>(),
+           "X"_a.noconvert(), "faces"_a.noconvert(), "bending_model"_a,
+           "rest_faces"_a.noconvert().none() = nb::none())
       .def("set_rest", &Elastic::set_rest, "X"_a.noconvert())
       .def("set_weave", &Elastic::set_weave, "axes"_a.noconvert(), "woven"_a.noconvert())
       .def("set_parameters", &Elastic::set_parameters, "stretch"_a.noconvert(),

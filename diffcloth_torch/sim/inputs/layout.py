@@ -47,8 +47,8 @@ class Layout:
         groups: Field of a control -> name -> its rows.
         cloth_names: Name of each of the C cloths.
         rows_by_name: Letter of an axis -> name -> rows: of surfaces "S", bodies "K", links "L" and
-            joints "J", both by robot too, of the vertices "N" and faces "F" of cloths, and of the
-            springs "A" of attachments.
+            joints "J", both by robot too, of the rest vertices "M" and faces "F" of cloths, and of
+            the springs "A" of attachments.
         joint_names: "robot/joint" of each of the J joints.
         link_names: "robot/link" of each of the L links.
     """
@@ -139,7 +139,7 @@ class Layout:
 
     def _rows_by_name(self) -> Mapping[str, Mapping[str, slice]]:
         assembly = self.assembly
-        starts = {"N": assembly.cloth_vertex_start, "F": assembly.cloth_face_start}
+        starts = {"M": assembly.cloth_rest_start, "F": assembly.cloth_face_start}
         of_cloths = {
             letter: {
                 name: slice(*ends)

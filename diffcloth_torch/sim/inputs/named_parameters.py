@@ -57,8 +57,8 @@ def named_rows(
         opening = label("parameters", f"{name}[{key!r}]")
         row = PARAMETERS[name].row_shape
         size = place.stop - place.start
-        # A single row has no axis of its own, but the vertices of a cloth do.
-        several = size > 1 or axes[0] == "N"
+        # A single row has no axis of its own, but the rest vertices of a cloth do.
+        several = size > 1 or axes[0] == "M"
         values = _checked(name, opening, value, (size, *row) if several else row, row, batch)
         rows = _replaced(rows, cpu.arange(place.start, place.stop), values)
     return rows

@@ -137,7 +137,7 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
     if name == "rest_positions":
         if not (values == default).all():
             for shape in values:
-                check_areas(operation(), name, shape, layout.assembly.faces)
+                check_areas(operation(), name, shape, layout.assembly.rest_faces)
         return
     if name in ("body_mass", "link_mass"):
         _refuse_rows(layout, name, values == 0.0, "> 0", layout.permissions.massive)

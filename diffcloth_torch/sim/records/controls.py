@@ -116,7 +116,8 @@ class Parameters:
         slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0; shape [].
         pin_stiffness: Stiffness of the soft pins [N/m], > 0; shape [] or [C].
         gravity: Acceleration of gravity [m/s^2], shape [3].
-        rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
+        rest_positions: Vertices of the rest meshes of the cloths [m], shape [M, 3]; M = N without
+            seams.
         attachment_stiffness: Stiffness of the springs of attachments [N/m], > 0, shape [A].
         normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C], [N]
             or [F].

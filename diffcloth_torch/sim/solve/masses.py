@@ -20,7 +20,7 @@ def vertex_masses(assembly: Assembly, parameters: Fields) -> Tensor:
         return cpu.zeros(1, 0)
     density, rest = parameters["density"], parameters["rest_positions"]
     corners = torch.from_numpy(assembly.faces).long()
-    a, b, c = rest[:, corners].unbind(-2)
+    a, b, c = rest[:, torch.from_numpy(assembly.rest_faces).long()].unbind(-2)
     area = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
     if density.shape[1] == assembly.cloth_count:
         counts = torch.from_numpy(np.diff(assembly.cloth_face_start)).long()
