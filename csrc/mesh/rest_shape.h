@@ -33,8 +33,7 @@ struct FittedSide {
 /// Source of a point of a chart: a corner of the base face, or a point unfolded about an edge.
 struct Unfolding {
   std::array<Index, 2> edge;  ///< local edge a -> b, to whose right it lies; {-1, -1} for a corner
-  std::array<Index, 3>
-      rest;  ///< rest vertices of a, b and the point, in one face; of the base face
+  std::array<Index, 3> rest;  ///< rest vertices of a, b and the point, all in one face
 };
 
 /// Vertices that each bending element couples.

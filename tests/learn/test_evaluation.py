@@ -14,6 +14,7 @@ from diffcloth_torch.envs import env as env_module
 from diffcloth_torch.envs.fold_cloth import FoldCloth
 from diffcloth_torch.learn import Episodes, Policy, Processes, TrainerOptions, evaluate
 from diffcloth_torch.learn import evaluation as module
+from diffcloth_torch.learn.evaluation import acting
 from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
 from diffcloth_torch.learn.trainer import Trainer
 
@@ -61,6 +62,13 @@ class TestEpisodes:
                 found = evaluate(make, policy, count, 3)
             assert_same_episodes(found, first(many, count))
             assert found.seeds == many.seeds[:count]
+
+    def test_have_actions_that_do_not_depend_on_others(self, policy):
+        """Products of matrices round by the number of rows."""
+        seen = torch.randn(8, policy.observations, generator=torch.Generator().manual_seed(0))
+        act = acting("evaluate", make(num_envs=1), policy)
+        with torch.no_grad():
+            assert torch.equal(act(seen), torch.cat([act(row[None]) for row in seen]))
 
     def test_begin_by_their_seeds(self, policy):
         found = evaluate(make, policy, 2, 7)
