@@ -4,6 +4,7 @@
     python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
     python -m benchmarks.figures --forward-peers NEWTON MUJOCO    # repeat only these peers
     python -m benchmarks.figures --environments "the first version=../first"    # repeat only these
+    python -m benchmarks.figures --integrators    # repeat only these
     python -m benchmarks.figures --draw    # redraw only the page
 
 `--against` names another checkout with a built package, and may be repeated: all scenes are timed
@@ -12,7 +13,8 @@ timed by phases, as by `benchmarks.step`, and with several losses in one backwar
 Python of an environment with Newton, which is timed beside this package as by `benchmarks.peers`.
 Measurements are stored in docs/performance.json, from which page and plots are made.
 `--forward-peers` repeats the measurements of `benchmarks.forward_peers`, with the Pythons of its
-two environments, and `--environments` those by `benchmarks.scripted`; both keep all other records.
+two environments, `--environments` those by `benchmarks.scripted`, and `--integrators` the part
+`explicit` of `benchmarks.integrators`; all keep all other records.
 
 `--cpu` counts processor time, for a shared machine; threads are then omitted, because processor
 time does not show their benefit.
@@ -39,6 +41,7 @@ from tqdm import tqdm
 import diffcloth_torch as dc
 from benchmarks import forward_peers, scripted
 from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
+from benchmarks.integrators import INTEGRATORS, errors_and_times
 from benchmarks.measure import time_steps
 from benchmarks.peers import time_all
 from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime, kept_file
@@ -83,6 +86,7 @@ Records = dict[str, Any]
 @click.option(
     "--environments", "environments", help="NAME=FOLDER with a built package; measure these alone."
 )
+@click.option("--integrators", "integrating", is_flag=True, help="Measure these alone.")
 @click.option("--cpu", is_flag=True, help="Processor time instead of wall-clock time.")
 @click.option("--quick", is_flag=True, help="Tiny sheets: shows that it runs.")
 @click.option("--draw", is_flag=True, help="Measure nothing: draw what was measured before.")
@@ -92,15 +96,17 @@ def main(
     newton: Path | None,
     forward: tuple[Path, Path] | None,
     environments: str | None,
+    integrating: bool,
     cpu: bool,
     quick: bool,
     draw: bool,
     docs: Path,
 ) -> None:
     file = docs / RECORDS
-    if draw or forward or environments:
+    if draw or forward or environments or integrating:
         if not file.exists():
-            option = "--draw" if draw else "--forward-peers" if forward else "--environments"
+            alone = "--environments" if environments else "--integrators"
+            option = "--draw" if draw else "--forward-peers" if forward else alone
             raise click.UsageError(f"{option} needs {file}, which a run without it writes")
         if forward and not draw:
             records = json.loads(file.read_text())
@@ -111,12 +117,16 @@ def main(
             ((release, folder),) = _folders([environments]).items()
             records["environments"] = measure_environments(release, folder, quick)
             file.write_text(json.dumps(records, indent=1) + "\n")
+        if integrating and not draw:
+            records = json.loads(file.read_text())
+            records["integrators"] = measure_integrators(quick)
+            file.write_text(json.dumps(records, indent=1) + "\n")
     else:
         earlier = json.loads(file.read_text()) if file.exists() else {}
         file.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as kept:
             measured = measure(_folders(others), newton, cpu, quick, Path(kept))
-        for part in ("forward_peers", "environments"):
+        for part in ("forward_peers", "environments", "integrators"):
             measured[part] = earlier.get(part)
         file.write_text(json.dumps(measured, indent=1) + "\n")
     records = json.loads(file.read_text())
@@ -218,6 +228,16 @@ def measure_environments(release: str, folder: Path, quick: bool) -> Records:
             scripted.time_row(row, folder, steps, turns)
             for row in tqdm(rows, desc="environments", disable=None, leave=False)
         ],
+    }
+
+
+def measure_integrators(quick: bool) -> Records:
+    """Return the errors and times of both integrators, with the date."""
+    torch.set_num_threads(1)
+    return {
+        "date": date.today().isoformat(),
+        "processor": _processor(),
+        "rows": errors_and_times(4, 0.1) if quick else errors_and_times(5, 0.5),
     }
 
 
@@ -398,6 +418,10 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     for release, rows in records["releases"].items():
         parts += [f"## Compared with {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
+    if records.get("integrators"):
+        found = records["integrators"]
+        parts += ["## Error against time", _integrator_text(found)]
+        parts += [_integrator_table(found["rows"])]
     losses = _pair_table(
         records["losses"], ["scene", "size", "losses"], {"loop": "loop", "once": "one call"}
     )
@@ -410,6 +434,29 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
         parts += ["## Compared with VBD and MuJoCo", _forward_peer_text(records["forward_peers"])]
         parts += [_forward_peer_table(records["forward_peers"]["rows"])]
     return "\n\n".join(parts) + "\n"
+
+
+def _integrator_text(found: Records) -> str:
+    return f"""\
+A sheet of 5 x 5 vertices swings from one edge for half a second, without drag and contact. An error
+is the root mean square difference of coordinates from the motion that DOP853 of SciPy finds for the
+same energies, at tolerances of 1e-8. Times are processor times of a simulated second, medians of
+three rollouts in turn, by `python -m benchmarks.integrators --part explicit`. Measured on
+{found["date"]} ({found["processor"]}). The [guide](guide.md#integrator) says when to take which."""
+
+
+def _integrator_table(rows: list[Records]) -> str:
+    head = ["time step [s]"]
+    for name in ("implicit Euler", "second order"):
+        head += [f"{name}: error [mm]", "time [ms/s]"]
+    lines = []
+    for row in rows:
+        line = [f"{row['h']:g}"]
+        for name in INTEGRATORS:
+            line += [_number(row[name]["error"]), _number(row[name]["milliseconds"])]
+        ratio = row["second_order"]["milliseconds"] / row["implicit_euler"]["milliseconds"]
+        lines.append([*line, _number(ratio)])
+    return _table([*head, "times, ratio"], lines)
 
 
 def _preface(records: Records) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from types import FrameType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 __all__ = [
     "AddedMassWarning",
@@ -25,6 +26,10 @@ __all__ = [
     "TurnedTooFar",
     "WorkerError",
 ]
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class InvalidInput(ValueError):  # noqa: N818 - names of the public contract
@@ -117,6 +122,30 @@ def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
         frame = frame.f_back
         level += 1
     warnings.warn(message, category, stacklevel=level)
+
+
+def renamed(**names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Take keywords under their earlier names, too, with a warning.
+
+    Args:
+        **names: Earlier name -> name.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        @wraps(function)
+        def call(*args: P.args, **keywords: P.kwargs) -> T:
+            for earlier in names.keys() & keywords.keys():
+                name = names[earlier]
+                owner = function.__name__
+                if name in keywords:
+                    raise TypeError(f"{owner}: `{earlier}` is `{name}`, which is given, too")
+                warn_caller(f"{owner}: `{earlier}` is named `{name}` since 0.2.0", FutureWarning)
+                keywords[name] = keywords.pop(earlier)
+            return function(*args, **keywords)
+
+        return call
+
+    return decorate
 
 
 def _is_inside(frame: FrameType) -> bool:

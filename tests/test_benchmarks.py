@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import math
 import subprocess
@@ -231,6 +232,19 @@ def test_our_side_of_a_peer_without_gradients(name):
         assert peers.judge(told, low)["inside"] > 0
         assert peers.judge(told, low)["depth"] > 20.0
     assert told["mass"] == pytest.approx(told["density"], rel=1e-9)  # of one square meter
+
+
+@pytest.mark.slow
+def test_errors_of_integrators_fall_with_the_time_step():
+    integrators = importlib.import_module("benchmarks.integrators")
+    rows = integrators.errors_and_times(4, 0.2, turns=1)
+    assert [row["h"] for row in rows] == [0.02, 0.01, 0.005, 0.0025]
+    euler, second = ([row[name]["error"] for row in rows] for name in integrators.INTEGRATORS)
+    # 5.29, 2.67, 1.34 and .67 mm; .46, .20, .07 and .02 mm: the sheet has modes faster than h.
+    assert all(1.8 < a / b < 2.2 for a, b in itertools.pairwise(euler))
+    assert second[0] > 10 * second[-1]
+    assert all(10 * b < a for a, b in zip(euler, second, strict=True))
+    assert all(row[name]["milliseconds"] > 0 for row in rows for name in integrators.INTEGRATORS)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from diffcloth_torch.errors import (
     NotConverged,
     SimulationError,
     TurnedTooFar,
+    renamed,
 )
 from diffcloth_torch.optimize.evaluation import (
     Evaluation,
@@ -131,6 +132,7 @@ class Descent:
         }
 
 
+@renamed(report="progress", found="resume")
 def descend(
     simulate: Simulate,
     loss: Loss,
@@ -143,10 +145,10 @@ def descend(
     restart: bool = False,
     failures: int = 6,
     stop_below: float | None = None,
-    report: Callable[[Descent], None] = lambda _: None,
-    found: Descent | None = None,
+    progress: Callable[[Descent], None] = lambda _: None,
+    resume: Descent | None = None,
     generator: torch.Generator | None = None,
-    progress: Progress | None = None,
+    bar: Progress | None = None,
 ) -> Descent:
     """Minimize a loss over inputs of a simulation: controls, parameters, starts, weights.
 
@@ -176,7 +178,7 @@ def descend(
         optimizer: Optimizer of torch over exactly these tensors, or a function from their list to
             such an optimizer. Optimizers that evaluate the loss themselves, such as LBFGS, are
             refused.
-        iterations: Number of evaluations that do not fail, including evaluations of `found`, >= 1.
+        iterations: Number of evaluations that do not fail, including evaluations of `resume`, >= 1.
         per_environment: Names of variables whose row i acts only in environment i. Each row follows
             the loss of its own environment; `clip` and `restart` apply to each row separately.
         clip: Largest norm of the gradient of each variable, > 0; None does not clip.
@@ -185,13 +187,13 @@ def descend(
         failures: Number of successive attempts that may fail, >= 0.
         stop_below: Loss, > 0, below which the loop ends if no environment of the best evaluation
             failed.
-        report: Called after each iteration with the results so far.
-        found: Results reported by an earlier loop, to continue that loop. Variables, optimizer and
-            generator are set to their states in `found`; the result has the same bits as without
+        progress: Called after each iteration with the results so far.
+        resume: Results reported by an earlier loop, to continue that loop. Variables, optimizer and
+            generator are set to their states in `resume`; the result has the same bits as without
             the interruption.
         generator: Generator from which `simulate` and `loss` draw random numbers; torch's own by
             default.
-        progress: Progress bar of the caller.
+        bar: Progress bar of the caller.
 
     Returns:
         The best evaluation and the history of all evaluations.
@@ -205,7 +207,7 @@ def descend(
         O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Foundations of
         Computational Mathematics 15 (2015), the function scheme.
     """
-    for name, function in (("simulate", simulate), ("loss", loss), ("report", report)):
+    for name, function in (("simulate", simulate), ("loss", loss), ("progress", progress)):
         if not callable(function):
             raise TypeError(f"descend: `{name}` must be a function, got {type(function).__name__}")
     check_count("descend: `iterations`", iterations, 1)
@@ -222,20 +224,20 @@ def descend(
         clip=clip,
         restart=restart,
         allowed=failures,
-        found=found,
+        found=resume,
     )
-    with progress or Progress(iterations) as bar:
-        bar.start(len(loop.history))
+    with bar or Progress(iterations) as shown:
+        shown.start(len(loop.history))
         while len(loop.history) < iterations and not _good_enough(loop.found, stop_below):
             try:
                 evaluation = evaluate(simulate, loss, variables, per_environment)
             except (InfeasibleMotion, NotConverged, TurnedTooFar, TrialError) as error:
                 loop.go_back(error)
-                bar.failed(len(loop.failures))
+                shown.failed(len(loop.failures))
                 continue
             sofar = loop.advance(evaluation)
-            bar.done(evaluation.loss, sofar.best.loss)
-            report(sofar)
+            shown.done(evaluation.loss, sofar.best.loss)
+            progress(sofar)
     assert loop.found is not None  # at least one iteration
     return loop.found
 

@@ -47,9 +47,9 @@ def optimize(
         # The configuration may have changed since the interruption.
         groups = optimizer.state_dict()["param_groups"]
         found = replace(found, optimizer={**found.optimizer, "param_groups": groups})
-    with Progress(options.iterations, task.steps, "step") as progress:
+    with Progress(options.iterations, task.steps, "step") as bar:
         return descend(
-            _simulation(task, progress.step),
+            _simulation(task, bar.step),
             task.loss,
             actions,
             optimizer,
@@ -58,9 +58,9 @@ def optimize(
             restart=options.restart,
             failures=options.failures,
             stop_below=options.stop_below,
-            report=report,
-            found=found,
-            progress=progress,
+            progress=report,
+            resume=found,
+            bar=bar,
         )
 
 

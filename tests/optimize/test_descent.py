@@ -337,7 +337,7 @@ def test_a_loop_goes_on_with_the_same_bits(make, per_environment, tmp_path):
     half = run({"a": leaf(0.9, -0.8)}, 4, generator=torch.Generator().manual_seed(7))
     torch.save(half.record(), tmp_path / "half.pt")
     found = dc.Descent.restore(torch.load(tmp_path / "half.pt", weights_only=True))
-    again = run({"a": leaf(0.0, 0.0)}, 9, generator=torch.Generator(), found=found)
+    again = run({"a": leaf(0.0, 0.0)}, 9, generator=torch.Generator(), resume=found)
     assert whole.failures, "the test should go through failures"
     assert again.failures == whole.failures
     assert again.metrics()["losses"] == whole.metrics()["losses"]
@@ -350,7 +350,7 @@ def test_random_numbers_of_torch_are_resumed():
     def run(iterations, found=None):
         simulate = lambda v: [state_of(v["a"] + torch.randn(1, dtype=F64))]  # noqa: E731
         return dc.descend(
-            simulate, total, {"a": leaf(1.0)}, ADAM, iterations=iterations, found=found
+            simulate, total, {"a": leaf(1.0)}, ADAM, iterations=iterations, resume=found
         )
 
     torch.manual_seed(3)
@@ -361,9 +361,24 @@ def test_random_numbers_of_torch_are_resumed():
     assert torch.equal(run(6, half).next_variables["a"], whole.next_variables["a"])
 
 
+def test_keywords_of_0_1_warn_with_the_names_of_today():
+    reports = []
+    options = {"iterations": 1, "optimizer": ADAM}
+    with pytest.warns(FutureWarning, match="descend: `report` is named `progress`") as caught:
+        found = dc.descend(bowl(), total, {"a": leaf(1.0)}, report=reports.append, **options)
+    assert caught[0].filename == __file__
+    assert len(reports) == 1
+    options["iterations"] = 2
+    with pytest.warns(FutureWarning, match="descend: `found` is named `resume` since 0.2.0"):
+        again = dc.descend(bowl(), total, {"a": leaf(5.0)}, found=found, **options)
+    assert again.history[0] == found.history[0]
+    with pytest.raises(TypeError, match="`found` is `resume`, which is given, too"):
+        dc.descend(bowl(), total, {"a": leaf(1.0)}, found=found, resume=found, **options)
+
+
 def test_reported_results_do_not_change_afterwards():
     reports = []
-    dc.descend(bowl(), total, {"a": leaf(1.0)}, ADAM, iterations=3, report=reports.append)
+    dc.descend(bowl(), total, {"a": leaf(1.0)}, ADAM, iterations=3, progress=reports.append)
     assert [len(found.history) for found in reports] == [1, 2, 3]
     steps = [found.optimizer["state"][0]["step"].item() for found in reports]
     assert steps == [1, 2, 3]
