@@ -142,6 +142,15 @@ def test_dynamic_bodies_are_timed_beside_prescribed_ones():
 
 
 @pytest.mark.slow
+def test_a_fit_is_made_in_all_ways():
+    command = [sys.executable, "-m", "benchmarks.step_bias", "--quick", "slide"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split()[0] for line in result.stdout.splitlines()[2:]]
+    assert rows == ["euler", "its", "extrapolated", "second_order", "its", "the"]
+
+
+@pytest.mark.slow
 def test_a_jacobian_is_timed_beside_its_rollout():
     command = [sys.executable, "-m", "benchmarks.tangents", "--size", "6", "--steps", "4"]
     command += ["--repeats", "1"]

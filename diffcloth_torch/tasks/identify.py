@@ -30,6 +30,7 @@ from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.problem import Residuals
 from diffcloth_torch.optimize.starts import Stage
 from diffcloth_torch.optimize.variables import Variable
+from diffcloth_torch.sim.half_step import at_half_step
 from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.task import ConfiguredTask
@@ -138,16 +139,23 @@ class _Motion:
         velocity = values.get(_VELOCITY)
         if velocity is None and self.velocity is not None:
             velocity = torch.from_numpy(self.velocity)
+        controller = self.task.controller({})
+        is_second_order = simulator.integrator == "second_order" and self.steps is not None
+        if velocity is None and is_second_order:
+            velocity = torch.zeros_like(start.velocities)
         if velocity is not None:
             free = torch.ones_like(start.velocities)
             for pinned in self.task.scene.cloths[0].pins.values():
                 free[torch.from_numpy(pinned.astype(np.int64))] = 0.0
-            assert parameters.gravity is not None  # the simulator sets it
-            # Implicit Euler lets gravity act for half a step too long before the first position;
-            # the second-order step takes the velocity of half a step earlier.
-            late = 0.5 * simulator.dt * parameters.gravity
-            start = start.replace(velocities=free * (velocity - late))
-        controller = self.task.controller({})
+            if is_second_order:
+                start = start.replace(velocities=free * velocity)
+                control = controller(0, start)
+                start = at_half_step(start, control, parameters, simulator=simulator)
+            else:
+                assert parameters.gravity is not None  # the simulator sets it
+                # Implicit Euler lets gravity act half a step too long before the first position.
+                late = 0.5 * simulator.dt * parameters.gravity
+                start = start.replace(velocities=free * (velocity - late))
         if self.steps is None:
             return [simulator.equilibrium(start, controller(0, start), parameters)]
         states = simulator.rollout(start, controller, parameters=parameters, steps=self.steps[-1])

@@ -250,7 +250,7 @@ def test_gradients_by_the_rest_vertices(scheme):
     scene = dc.Scene([cloth], [box] if contact else [], gravity=(0.3, 0.0, -5.0))
     options = {} if contact is None else {"contact": contact}
     simulator = dc.Simulator(scene, 0.01, scheme=scheme, solver=solver, **options)
-    given, state = simulator.parameters(), simulator.initial_state()
+    given, state = simulator.default_parameters(), simulator.initial_state()
     weights = torch.as_tensor(np.random.default_rng(0).normal(size=cloth.vertices.shape))
 
     def loss(inputs):
@@ -264,10 +264,10 @@ def test_gradients_by_the_rest_vertices(scheme):
 
 def test_gradient_of_the_masses_by_the_rest_vertices():
     simulator = simulator_of(tube(5))
-    rest = simulator.parameters().rest_positions
+    rest = simulator.default_parameters().rest_positions
 
     def total(inputs):
-        masses = simulator.vertex_masses(simulator.parameters().replace(**inputs))
+        masses = simulator.vertex_masses(simulator.default_parameters().replace(**inputs))
         return (masses * torch.linspace(1, 2, len(masses), dtype=F64)).sum()
 
     assert directional(total, {"rest_positions": rest}, ["rest_positions"]) < 1e-7
@@ -283,7 +283,7 @@ def test_rest_positions_by_the_name_of_a_cloth():
     )
     contact = dc.ContactOptions(self_contact=False)
     simulator = dc.Simulator(dc.Scene([flat, cloth]), 0.01, contact=contact)
-    rest = simulator.parameters().rest_positions
+    rest = simulator.default_parameters().rest_positions
     assert rest.shape == (9 + len(cloth.rest_positions), 3)
     named = dc.Parameters(rest_positions={"tube": 1.1 * torch.tensor(cloth.rest_positions)})
     masses = simulator.vertex_masses(named) / simulator.vertex_masses()

@@ -201,6 +201,19 @@ def test_extrapolated_configurations_are_fitted_without_the_bias(config):
     assert not load_task(config).checks_step, "an equilibrium has no time step"
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+def test_the_second_order_step_has_less_bias_and_its_own_order(config):
+    task = load_task(config, [*FALL, "simulation.integrator=second_order"])
+    found = dc.fit(task.variables(), task.residuals(), **task.options())
+    drag = float(found.values["normal_drag"])
+    assert drag == pytest.approx(2.0, rel=0.04)
+    with pytest.warns(dc.StepBiasWarning, match="normal_drag"):
+        shift = found.step_bias(task.finer(task.observed), order=task.order)
+    assert drag + float(shift["normal_drag"]) == pytest.approx(2.0, rel=0.01)
+    assert task.order == 2.0
+    assert load_task(config, FALL).order == 1.0
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
