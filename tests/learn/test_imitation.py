@@ -73,13 +73,15 @@ def test_plans_are_followed_and_planned_again():
     # Plans from the start, and from up to two later times of an episode of five transitions.
     assert len(seen) == len(shown) > 10
     assert len(lessons._knots) == len(lessons._seen) >= 3 + 2 * 2
-    # From the start, the new plans are no worse than the nearest ones.
-    place = env.env_state
-    returns = [
-        improve(env, place, knots, 0).returns
-        for knots in (lessons._knots[3:5], lessons._knots[:1].expand(2, -1, -1))
-    ]
-    assert bool((returns[0] >= returns[1] - 1e-2).all())
+    # Plans from the start begin from the nearest ones, and five steps of .03 lead no further.
+    near = torch.cdist(policy.scale(first), policy.scale(lessons._seen[:3, 0])).argmin(dim=1)
+    moved = lessons._knots[3:5] - lessons._knots[near]
+    assert float(moved.abs().max()) < 0.2
+    old, new = (
+        improve(env, env.env_state, knots, 0).returns
+        for knots in (lessons._knots[near], lessons._knots[3:5])
+    )
+    assert bool((new >= old).all())
 
 
 def test_plans_teach():
