@@ -203,7 +203,9 @@ def test_pieces_fall_as_one_sheet(scheme):
 
 def test_the_default_barrier_is_the_one_of_the_sheet():
     flat = dc.Cloth.grid((7, 6), (0.3, 0.2))
-    found = [dc.Simulator(dc.Scene([cloth]), 0.01).parameters() for cloth in (flat, pieces(flat))]
+    found = [
+        dc.Simulator(dc.Scene([cloth]), 0.01).default_parameters() for cloth in (flat, pieces(flat))
+    ]
     for name in ("barrier_distance", "barrier_stiffness"):
         values = [getattr(parameters, name) for parameters in found]
         torch.testing.assert_close(values[1], values[0], rtol=1e-9, atol=0)
