@@ -72,7 +72,8 @@ class DepthCamera:
             point = float_array(f"DepthCamera: `{name}`", getattr(self, name))
             check_shape(f"DepthCamera: `{name}`", point.shape, [(3,)])
             check_finite(f"DepthCamera: `{name}`", point)
-        view = np.asarray(self.target, float) - np.asarray(self.position, float)
+            object.__setattr__(self, name, tuple(point.tolist()))  # a list may change later
+        view = np.subtract(self.target, self.position)
         lengths = np.linalg.norm(view) * np.linalg.norm(self.up)
         if not np.linalg.norm(np.cross(view, self.up)) > _ALONG * lengths:
             raise InvalidInput(
@@ -92,8 +93,8 @@ class DepthCamera:
     @cached_property
     def axes(self) -> FloatArray:
         """Axes of the camera in the world, [3, 3]: rows to the right, down, and forward."""
-        forward = np.asarray(self.target, float) - np.asarray(self.position, float)
-        right = np.cross(forward, np.asarray(self.up, float))
+        forward = np.subtract(self.target, self.position)
+        right = np.cross(forward, self.up)
         rows = np.stack([right, np.cross(forward, right), forward])
         axes: FloatArray = rows / np.linalg.norm(rows, axis=1, keepdims=True)
         return axes

@@ -250,6 +250,17 @@ def test_no_extra_is_needed(monkeypatch):
     assert image(env, env.reset(seed=0)[0]).std() > 0.1
 
 
+def test_a_camera_keeps_its_place():
+    position = np.array([0.0, 0.0, 1.0])
+    camera = envs.DepthCamera(position, torch.tensor([0.0, 1.0, 0.0]))
+    position += 1
+    assert camera.position == (0.0, 0.0, 1.0)
+    np.testing.assert_allclose(camera.axes[2], np.array([0.0, 1.0, -1.0]) / 2**0.5)
+    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(camera.axes) == pytest.approx(1.0)
+    np.testing.assert_allclose(transform(np.eye(3), camera.pose) - camera.position, camera.axes)
+
+
 def test_cameras_that_are_refused():
     right = {"position": [0.0, 0.0, 1.0], "target": [0.0, 1.0, 0.0]}
     wrong = [
