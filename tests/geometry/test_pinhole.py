@@ -79,3 +79,12 @@ def test_both_sides_are_seen_and_nothing_behind():
     assert one.depths[middle] == pytest.approx(2.2, abs=0.02)
     behind = nearest_triangles(vertices - np.array([0, 0, 3.0]), faces, FOCAL, SIZE)
     assert (behind.triangles == -1).all()
+
+
+def test_a_floor_that_reaches_behind_the_camera_is_seen_up_to_the_lower_border():
+    vertices = np.array([[-50.0, 1.0, 50.0], [50.0, 1.0, 50.0], [0.0, 1.0, -50.0]])
+    seen = nearest_triangles(vertices, np.array([[0, 1, 2]]), FOCAL, SIZE)
+    y = rays()[..., 1]
+    floor = y > 1 / 50
+    np.testing.assert_array_equal(seen.triangles >= 0, floor)
+    np.testing.assert_allclose(seen.depths[floor], 1 / y[floor], rtol=1e-12)
