@@ -501,6 +501,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     ),
     "envs.ClothVectorEnv.scripted_actions": lambda w: call(begun(w).scripted_actions),
     "envs.ClothVectorEnv.step": lambda w: call(begun(w).step, [[0.1] * 8, [-0.1] * 8]),
+    "envs.DepthCamera": lambda w: call(
+        dc.envs.DepthCamera, [0.0, 0.0, 1.0], [0.0, 0.5, 0.0], width=32
+    ),
     "envs.EnvState": lambda w: record(dc.envs.EnvState, w.env_state),
     "envs.EnvState.detach": lambda w: call(w.env_state.detach),
     "envs.EnvState.rows": lambda w: call(w.env_state.rows, torch.tensor([1], device="cpu")),
@@ -525,6 +528,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "envs.Task.reward": lambda w: call(w.env.task.reward, w.env_state),
     "envs.Task.sample": lambda w: call(w.env.task.sample, torch.Generator("cpu").manual_seed(2)),
     "envs.Task.scripted": lambda w: call(w.env.task.scripted, w.env_state),
+    "envs.Task.sensed": lambda w: call(w.env.task.sensed, w.env_state),
     "envs.Task.start": lambda w: call(
         w.env.task.start, [w.env.task.draw(torch.Generator("cpu").manual_seed(2))]
     ),

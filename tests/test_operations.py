@@ -115,6 +115,7 @@ INNER = {
     "envs.Task.reward",
     "envs.Task.sample",
     "envs.Task.scripted",
+    "envs.Task.sensed",
     "envs.Task.start",
     "envs.Task.succeeded",
     "envs.Task.success",

@@ -17,6 +17,7 @@ from typing import Any
 
 from diffcloth_torch.checks import check_choice
 from diffcloth_torch.envs.actuators import Actuator, Pickers, Velocities
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.drop_cloth import DropCloth
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
@@ -44,6 +45,7 @@ __all__ = [
     "Actuator",
     "ClothEnv",
     "ClothVectorEnv",
+    "DepthCamera",
     "EnvState",
     "Pickers",
     "Task",
@@ -82,8 +84,8 @@ def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
         num_envs: Number of environments that step together.
         **options: `seed`, `autoreset_mode` and `render_mode` as for `ClothVectorEnv`. The other
             options are passed to a task given by name: `size`, `horizon`, `substeps`,
-            `observation`, `material`, `contact`, `solver`, `frame`, `randomize`, and options of the
-            task.
+            `observation`, `camera`, `material`, `contact`, `solver`, `frame`, `randomize`, and
+            options of the task.
 
     Raises:
         InvalidInput: If a name or value is not accepted.

@@ -12,8 +12,11 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import ArrayLike, check_choice, check_count
 from diffcloth_torch.envs.actuators import Actuator
-from diffcloth_torch.envs.env import Task
+from diffcloth_torch.envs.depth_camera import DepthCamera, Sight
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.frames import points_in, poses_in
 from diffcloth_torch.envs.randomization import Ranges
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -24,7 +27,8 @@ from diffcloth_torch.sim.simulator import Simulator
 __all__ = ["DT", "BuiltTask", "key_rows", "with_material"]
 
 DT = 0.02  # [s]
-OBSERVATIONS = ("keypoints", "particles")
+OF_CAMERA = ("depth", "points")
+OBSERVATIONS = ("keypoints", "particles", *OF_CAMERA)
 _KEY_POINTS = 4  # along a side
 
 
@@ -33,10 +37,16 @@ class BuiltTask(Task):
 
     Attributes:
         side: Number of vertices along a side of a sheet.
-        sees: "keypoints" or "particles": the vertices that are observed.
+        sees: "keypoints", "particles", "depth" or "points": how the cloth is observed.
+        camera: The camera of "depth" and "points"; None with the others.
+        view: The camera of the task, unless another is passed; a task may have none.
+        of_cloth: Names of the features that are known from the vertices of cloths alone: "depth"
+            and "points" are observed in their place.
     """
 
     steps: ClassVar[int]  # default number of transitions of an episode
+    view: ClassVar[DepthCamera | None] = None
+    of_cloth: ClassVar[tuple[str, ...]] = ("positions", "velocities", "contact_forces")
 
     def __init__(
         self,
@@ -45,6 +55,7 @@ class BuiltTask(Task):
         horizon: int | None = None,
         substeps: int = 2,
         observation: str = "keypoints",
+        camera: DepthCamera | None = None,
         material: Material | None = None,
         contact: ContactOptions | None = None,
         solver: SolverOptions | None = None,
@@ -58,7 +69,9 @@ class BuiltTask(Task):
             size: Vertices along a side of a sheet, >= 4.
             horizon: Transitions of an episode; by default a fifth more than the script needs.
             substeps: Time steps of a transition, of .02 s each.
-            observation: "keypoints" for some vertices, or "particles" for all.
+            observation: Observation of the cloth: "keypoints" for some vertices, "particles" for
+                all, "depth" for an image or "points" for a point cloud of a depth camera.
+            camera: Camera of "depth" and "points"; None means the camera of the task.
             material: Material of the cloths; None means the material of the task.
             contact: Options of contact; None means the options of the task.
             solver: Options of the solver; a step that fails never raises here.
@@ -73,6 +86,7 @@ class BuiltTask(Task):
         self.sees = check_choice(f"{owner}: `observation`", observation, OBSERVATIONS)
         for name, value, kind in (
             ("material", material, Material),
+            ("camera", camera, DepthCamera),
             ("contact", contact, ContactOptions),
             ("solver", solver, SolverOptions),
         ):
@@ -80,7 +94,21 @@ class BuiltTask(Task):
                 raise TypeError(
                     f"{owner}: `{name}` must be {kind.__name__} or None, got {type(value).__name__}"
                 )
+        if camera is not None and self.sees not in OF_CAMERA:
+            raise InvalidInput(
+                f"{owner}: `camera` must be None with `observation` {self.sees!r}, which is not of "
+                "a camera"
+            )
         scene, actuator = self.build(material)
+        self.camera, self._sight = None, None
+        if self.sees in OF_CAMERA:
+            self.camera = self.view if camera is None else camera
+            if self.camera is None:
+                raise InvalidInput(
+                    f"{owner}: `camera` must be a DepthCamera with `observation` {self.sees!r}, as "
+                    "the task has none"
+                )
+            self._sight = Sight(self.camera, scene)
         simulator = Simulator(
             scene,
             DT,
@@ -108,6 +136,24 @@ class BuiltTask(Task):
     def observed(self, env_time: Tensor) -> Tensor:
         """The share of the horizon that has passed, [B, 1]."""
         return env_time.double()[:, None] / self.horizon
+
+    def sensed(self, env: EnvState) -> Mapping[str, Tensor]:
+        """Features; with a camera its view in the place of those of the cloth.
+
+        A depth image [m], by rows, and the pose of the camera [B, 7]; or points [m], one behind the
+        other. Pose and points are in the frame of the task.
+        """
+        features = self.features(env)
+        if self._sight is None or self.camera is None:
+            return features
+        others = {name: f for name, f in features.items() if name not in self.of_cloth}
+        if self.sees == "points":
+            return {
+                "points": points_in(env.drawn, self._sight.points(env.state)).flatten(1)
+            } | others
+        pose = cpu.tensor(self.camera.pose).expand(len(env), -1)
+        depths = self._sight.depths(env.state).flatten(1)
+        return {"depth": depths, "camera": poses_in(env.drawn, pose)} | others
 
 
 def key_rows(size: int, observation: str) -> Tensor:

@@ -268,9 +268,13 @@ class Task(ABC):
         """Return whether the task was done in each of the last `holds` transitions [B]."""
         return env.held >= self.holds
 
+    def sensed(self, env: EnvState) -> Mapping[str, Tensor]:
+        """Name -> observed quantity [B, n] that a policy receives: all features, by default."""
+        return self.features(env)
+
     def observation(self, env: EnvState) -> Tensor:
-        """Observation of a policy, float64 [B, O]: all features, concatenated."""
-        return torch.cat(list(self.features(env).values()), dim=-1)
+        """Observation of a policy, float64 [B, O]: all `sensed` quantities, concatenated."""
+        return torch.cat(list(self.sensed(env).values()), dim=-1)
 
     def in_world(self, env: EnvState, actions: Tensor) -> Tensor:
         """Actions [B, A] in world axes."""
@@ -309,8 +313,8 @@ class Task(ABC):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """Name of a feature -> its slice of an observation."""
-        sizes = {n: f.shape[-1] for n, f in self.features(self.example()).items()}
+        """Name of an observed quantity -> its slice of an observation."""
+        sizes = {n: f.shape[-1] for n, f in self.sensed(self.example()).items()}
         ends = cpu.tensor(list(sizes.values()), dtype=torch.int64).cumsum(0).tolist()
         return {
             n: slice(end - size, end) for (n, size), end in zip(sizes.items(), ends, strict=True)

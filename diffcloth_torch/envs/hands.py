@@ -11,6 +11,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Hand, Tools
 from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.frames import Frame, points_in, pose_frame, poses_in, vectors_in
 from diffcloth_torch.envs.sheets import uniform
@@ -46,6 +47,7 @@ class HandTask(BuiltTask):
     """
 
     steps = 40
+    view = DepthCamera([0.4, -0.4, 0.45], [0.0, 0.0, 0.19])
     obstacles: ClassVar[tuple[RigidBody, ...]] = ()
 
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
@@ -126,6 +128,7 @@ class LiftCloth(HandTask):
     """
 
     name = "LiftCloth"
+    of_cloth = (*HandTask.of_cloth, "to_goal")
     _CLOSE = LENGTH / 6
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:

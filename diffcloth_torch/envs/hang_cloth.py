@@ -7,6 +7,7 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.frames import vectors_in
 from diffcloth_torch.envs.hands import LENGTH, HandTask, twist_to
@@ -45,6 +46,8 @@ class HangCloth(HandTask):
     """
 
     name = "HangCloth"
+    view = DepthCamera([0.65, -0.6, 0.55], [0.19, 0.0, 0.2])
+    of_cloth = (*HandTask.of_cloth, "to_goal")
     steps = 140
     obstacles = (_peg("left_peg", _ASIDE), _peg("right_peg", -_ASIDE))
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Tools, Twist
 from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
 from diffcloth_torch.model.materials import Material
@@ -43,6 +44,8 @@ class HitCloth(BuiltTask):
 
     name = "HitCloth"
     steps = 36
+    view = DepthCamera([2.0, 2.0, 2.0], [0.0, 0.4, 1.1])
+    of_cloth = (*BuiltTask.of_cloth, "to_target")
 
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
         """See `BuiltTask`."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Tools, Velocities
 from diffcloth_torch.envs.built import DT, BuiltTask, with_material
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.frames import Frame, level_frame, points_in, poses_in, vectors_in
 from diffcloth_torch.envs.sheets import uniform
@@ -37,6 +38,7 @@ class PushCube(BuiltTask):
 
     name = "PushCube"
     steps = 60
+    view = DepthCamera([0.7, 0.6, 0.6], [0.0, 0.08, 0.12])
 
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
         """See `BuiltTask`."""
@@ -57,7 +59,7 @@ class PushCube(BuiltTask):
         self._pins = [row for rows in pins.values() for row in rows]
         count = size * size
         some = cpu.linspace(0, count - 1, 16).round().long()
-        self._rows = some if self.sees == "keypoints" else cpu.arange(count)
+        self._rows = cpu.arange(count) if self.sees == "particles" else some
         return Scene([sheet], scene.bodies), Velocities(pins, dt=DT, speed=_SPEED)
 
     @property

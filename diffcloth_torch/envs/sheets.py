@@ -13,6 +13,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Pickers, Tools
 from diffcloth_torch.envs.built import BuiltTask, key_rows
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.frames import Frame, level_frame, points_in, vectors_in
 from diffcloth_torch.model.cloth import Cloth
@@ -48,6 +49,7 @@ class SheetTask(BuiltTask):
     """
 
     steps = 50
+    view = DepthCamera([0.65, -0.5, 0.75], [0.06, 0.0, 0.08])
     beside: ClassVar[float] = 0.012  # largest initial offset of a picker beside its vertex [m]
     above: ClassVar[tuple[float, float]] = (0.01, 0.02)  # range of its height above the vertex [m]
 

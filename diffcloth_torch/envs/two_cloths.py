@@ -8,6 +8,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Forces, Tools
 from diffcloth_torch.envs.built import BuiltTask, with_material
+from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.model.materials import Material
@@ -34,6 +35,8 @@ class TwoCloths(BuiltTask):
 
     name = "TwoCloths"
     steps = 60
+    view = DepthCamera([-0.1, -0.8, 0.6], [-0.08, 0.0, 0.0])
+    of_cloth = ("positions", "velocities", "to_target", "center_velocity")
 
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
         """See `BuiltTask`."""
@@ -53,7 +56,7 @@ class TwoCloths(BuiltTask):
         steady[pulled] = cpu.tensor([_PULL, 0.0, weight]) / len(ends)
         self._count, self._center = count, cpu.tensor(sections["target"]["position"])
         some = cpu.linspace(0, 2 * count - 1, 20).round().long()
-        self._rows = some if self.sees == "keypoints" else cpu.arange(2 * count)
+        self._rows = cpu.arange(2 * count) if self.sees == "particles" else some
         return Scene(cloths), Forces([ends], steady, largest=_LARGEST)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -65,13 +68,14 @@ class TwoCloths(BuiltTask):
         return self.simulator.initial_state(len(drawn["target"])), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of both strips, and the remaining way of the center."""
+        """Some vertices of both strips, and the remaining way of the center, or the target."""
         state = env.state
         return {
             "positions": state.positions[:, self._rows].flatten(1),
             "velocities": state.velocities[:, self._rows].flatten(1),
             "to_target": self._away(env),
             "center_velocity": state.velocities[:, : self._count].mean(dim=1),
+            **({} if self.camera is None else {"goal": env.drawn["target"]}),
             "time": self.observed(env.elapsed),
         }
 
