@@ -128,7 +128,12 @@ def _read_0_1(owner: str, path: Path, file: BinaryIO, kind: str) -> Any:
             raise InvalidInput(f"its entry {damaged} was changed since it was written")
         file.seek(0)
         content = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
-        return CHECKPOINTS[kind](content)
+        try:
+            return CHECKPOINTS[kind](content)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InvalidInput(
+                f"it is no complete checkpoint, nor one of a {kind} of 0.1"
+            ) from error
 
 
 def _record(owner: str, path: Path, file: BinaryIO) -> dict[str, Any]:

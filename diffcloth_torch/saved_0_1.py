@@ -69,7 +69,14 @@ def _trainer(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fit(content: dict[str, Any]) -> dict[str, Any]:
-    return content
+    """A start of a fit, which had no ties, and priors of single numbers only."""
+    (names, kept, low, high, means, precisions), *rest = content["problem"]
+    whitening = [
+        [precision if column == row else 0.0 for column in range(len(precisions))]
+        for row, precision in enumerate(precisions)
+        if precision > 0
+    ]
+    return content | {"problem": [[names, kept, [], low, high, means, whitening], *rest]}
 
 
 CHECKPOINTS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {

@@ -58,6 +58,7 @@ _REPORT = {
     "episodes": 0, "success": 0.0, "interval": [0.0, 0.0], "ever": 0.0, "failed": 0.0,
     "blocked": 0.0, "return": 0.0, "steps": 0, "minutes": 0.0,
 }  # fmt: skip
+_UPDATES = 100  # by default
 _LOOKS = 5  # at policies, of which the best one is kept
 _SHAPE = ("plan_knots", "hidden", "init_std")  # options that shape a policy
 _NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # set by the trainer
@@ -471,7 +472,7 @@ def _options(section: TrainConfig) -> dict[str, Any]:
 def _updates(section: TrainConfig) -> int:
     """Return the number of updates of the policy by the trainer."""
     if not section.stages:
-        return section.updates
+        return _UPDATES if section.updates is None else section.updates
     last = section.stages[-1]
     return last.updates if isinstance(last, UpdateStage) else 0
 

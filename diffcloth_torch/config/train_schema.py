@@ -94,6 +94,7 @@ class TrainConfig(Section):
     the end reported in `report_episodes` fresh ones. With `until_success` training ends before its
     last update, as soon as that share of `episodes` succeeds. With `tryout` the seed of `trainer`
     is the one with the largest return after the updates there, which count as the first ones.
+    `updates` is 100 by default.
 
     With `stages` a policy begins at plans or at a teacher; the last stage may be updates by a
     trainer, which are bounded and checked, see `Trainer`. `seed` is the seed of the trainer and of
@@ -107,7 +108,7 @@ class TrainConfig(Section):
     trainer: dict[str, Any] = {}
     num_envs: Count = 4
     chunk: Count | None = None
-    updates: Updates = 100
+    updates: Updates | None = None
     evaluate_every: Count = 10
     episodes: Count = 8
     selection_episodes: Episodes = 16
@@ -128,7 +129,7 @@ class TrainConfig(Section):
                 raise ValueError("`tryout` and `stages` exclude each other")
             if "imitate" not in kinds:
                 raise ValueError("`stages` must have one of the kind imitate, which makes a policy")
-            if "algorithm" in self.trainer or "updates" in self.model_fields_set:
+            if "algorithm" in self.trainer or self.updates is not None:
                 raise ValueError("with `stages`, the last stage has the algorithm and the updates")
         for k, stage in enumerate(self.stages):
             if isinstance(stage, UpdateStage) and k < len(kinds) - 1:

@@ -378,7 +378,7 @@ def _stage(
     """Results of pieces, one behind the other; without workers in the local environments."""
     if workers is None:
         return Improved.together([_improved(local, piece) for piece in pieces])
-    name = pickled("plan: `make`", make)
+    name = pickled("plan: with `workers`, `make`", make)
     return Improved.together(list(workers.map(_improved_remotely, [(name, p) for p in pieces])))
 
 

@@ -281,7 +281,7 @@ def test_plans_that_are_refused(change, error, message):
         (
             {"make": lambda num_envs: MAKE(num_envs=num_envs), "workers": Processes(1)},
             InvalidInput,
-            "`make` must, with `workers`, be a function of a module",
+            "with `workers`, `make` must be a function of a module",
         ),
         (
             {"make": lambda num_envs, size=5: MAKE(num_envs=num_envs, horizon=size), "coarse": 4},
