@@ -20,7 +20,7 @@ from diffcloth_torch.learn.policy import Policy
 
 __all__ = ["Kept", "TrustRegion", "for_fine_tuning"]
 
-_MAX_CHANGE = 0.02  # of actions; changes of 0.1 in a FoldCloth episode move a picker by 9 cm
+_MAX_CHANGE = 0.02  # 0.1 in each action of a FoldCloth episode moves a picker by 9 cm
 _HELD_OUT = 16
 _HALVINGS = 20
 _RESTORED = ("actor", "scale")  # parts of a policy on which actions depend
