@@ -1,9 +1,9 @@
-"""Checkpoints: one kind of file for trainings, fits and optimizations, checked before it is used.
+"""Checkpoints: one file format for trainings, fits and optimizations, verified before use.
 
 A file is an archive of `torch.save`, which `torch.load` reads, followed by a record: JSON with the
 format, the kind of content and the version of the package; a digest of everything before it; the
 length of the JSON; and a mark. The digest is verified before anything is unpickled. Files of 0.1
-have the archive alone.
+consist of the archive alone.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ __all__ = [
 ]
 
 FORMAT = 1
-"""Number of the format; raised where an older reader would misread a file."""
+"""Number of the format; increased if an older reader would misread a file."""
 
 _MARK = b"diffclth"
 _DIGEST_SIZE = hashlib.sha256().digest_size
 _LENGTH_SIZE = 4
 _LARGEST_RECORD = 4096  # bytes of JSON
 _END_SIZE = _DIGEST_SIZE + _LENGTH_SIZE + len(_MARK)
-_CHUNK = 1 << 20  # bytes that are hashed at once
+_CHUNK = 1 << 20  # bytes hashed at once
 
 _ARCHIVE, _ARCHIVE_END = b"PK\x03\x04", b"PK\x05\x06"  # signatures of a ZIP file
-_ARCHIVE_REST = 18  # bytes after the second one, the last two of which count those of a comment
+_ARCHIVE_REST = 18  # bytes after the end signature; the last two hold the length of a comment
 
 
 def write_checkpoint(path: Path, kind: str, content: object) -> None:
@@ -60,13 +60,13 @@ def write_checkpoint(path: Path, kind: str, content: object) -> None:
 
     Args:
         path: The file, in an existing folder.
-        kind: Of the content, such as "training".
-        content: In types that `torch.load` reads with `weights_only`.
+        kind: Kind of the content, such as "trainer".
+        content: Content, of types that `torch.load` reads with `weights_only`.
 
     Raises:
-        OSError: If it cannot be written; the file at `path` stays as it is.
+        OSError: If the file cannot be written; an older file at `path` remains unchanged.
     """
-    # torch reports a full disk as a RuntimeError, and only where it writes the file itself.
+    # Written by Python: torch.save to a path would report a full disk as a RuntimeError.
     archive = BytesIO()
     torch.save(content, archive)
     record = {"format": FORMAT, "kind": kind, "version": version("diffcloth-torch")}
@@ -79,16 +79,17 @@ def write_checkpoint(path: Path, kind: str, content: object) -> None:
 
 
 def read_checkpoint(owner: str, path: Path, *kinds: str) -> Any:
-    """Read the content of a file whose digest is right.
+    """Read the content of a file after verification of its digest.
 
     Args:
-        owner: Opens messages.
+        owner: Prefix of messages.
         path: The file.
-        kinds: Accepted ones of the content, as in `write_checkpoint`.
+        kinds: Accepted kinds of content, as in `write_checkpoint`.
 
     Raises:
-        InvalidInput: If the file has no such content, or was changed since it was written.
-        OSError: If it cannot be read.
+        InvalidInput: If the file has no content of these kinds, or was changed since it was
+            written.
+        OSError: If the file cannot be read.
     """
     with open_regular_file(path) as file:
         old = [kind for kind in kinds if kind in CHECKPOINTS]
@@ -113,7 +114,7 @@ def read_checkpoint(owner: str, path: Path, *kinds: str) -> Any:
 
 
 def _is_of_0_1(file: BinaryIO) -> bool:
-    """Whether a file begins and ends as an archive without a comment."""
+    """Return whether a file begins and ends like an archive without a comment."""
     start = file.read(len(_ARCHIVE))
     file.seek(max(os.fstat(file.fileno()).st_size - len(_ARCHIVE_END) - _ARCHIVE_REST, 0))
     end = file.read()
@@ -167,10 +168,10 @@ def _record(owner: str, path: Path, file: BinaryIO) -> dict[str, Any]:
 
 @contextmanager
 def refusing_damage(owner: str, path: Path) -> Iterator[None]:
-    """Name the file in all errors of a block that reads its content.
+    """Add the name of a file to errors of a block that reads the file.
 
     Raises:
-        InvalidInput: If the block raises anything but `OSError` and `MemoryError`.
+        InvalidInput: If the block raises any error except `OSError` and `MemoryError`.
     """
     try:
         yield
@@ -178,7 +179,7 @@ def refusing_damage(owner: str, path: Path) -> Iterator[None]:
         raise
     except (InvalidInput, TypeError, SimulationError) as error:
         raise InvalidInput(f"{owner}: {path}: {error}") from error
-    except Exception as error:  # any that parsers and unpicklers raise for other bytes
+    except Exception as error:  # parsers and unpicklers raise many kinds for damaged bytes
         kind = type(error).__name__
         raise InvalidInput(f"{owner}: {path} is damaged, its content raises {kind}") from error
 
@@ -186,11 +187,11 @@ def refusing_damage(owner: str, path: Path) -> Iterator[None]:
 def check_like(name: str, given: Any, example: Any) -> None:
     """Require the structure of an example, and finite numbers.
 
-    Tensors must have its shape and dtype, integers must be counts; mappings must have its keys,
-    sequences its length.
+    Tensors must have the shape and dtype of the example, mappings its keys, sequences its length;
+    integers must be counts.
 
     Raises:
-        InvalidInput: If anything differs; the message names it.
+        InvalidInput: If an entry differs; the message names the entry.
     """
     if isinstance(example, Mapping):
         if not isinstance(given, dict) or given.keys() != example.keys():
@@ -215,10 +216,10 @@ def check_like(name: str, given: Any, example: Any) -> None:
 
 
 def check_structure(name: str, given: Any, example: Mapping[str, Tensor]) -> None:
-    """Require tensors of the names, shapes and dtypes of others; numbers may be infinite or NaN.
+    """Require the names, shapes and dtypes of example tensors; numbers may be infinite or NaN.
 
     Raises:
-        InvalidInput: If anything differs; the message names it.
+        InvalidInput: If an entry differs; the message names the entry.
     """
     if not isinstance(given, dict) or given.keys() != example.keys():
         _refuse(name, f"have the keys {', '.join(example)}", given)
@@ -247,7 +248,7 @@ def check_generator(name: str, given: Any) -> None:
     """Require the state of a random generator.
 
     Raises:
-        InvalidInput: If it is none.
+        InvalidInput: If `given` is no such state.
     """
     generator = cpu.generator()
     check_like(name, given, generator.get_state())
@@ -261,13 +262,13 @@ def check_optimizer(name: str, given: Any, optimizer: torch.optim.Optimizer) -> 
     """Require the state of an optimizer, before its first step or after it.
 
     Raises:
-        InvalidInput: If the optimizer could not go on with it.
+        InvalidInput: If the optimizer cannot load the state.
     """
     trial = copy.deepcopy(optimizer)
     for group in trial.param_groups:
         for parameter in group["params"]:
             parameter.grad = torch.zeros_like(parameter)
-    with cpu.DEVICE:  # where optimizers keep their counts
+    with cpu.DEVICE:  # device of the step counts of optimizers
         trial.step()
     example = trial.state_dict()
     if not isinstance(given, dict) or given.keys() != example.keys():
@@ -279,14 +280,14 @@ def check_optimizer(name: str, given: Any, optimizer: torch.optim.Optimizer) -> 
         like = dict(example["state"][key])
         steps = entry.get("step") if isinstance(entry, dict) else None
         if isinstance(steps, Tensor) and steps.dtype in (torch.float32, torch.float64):
-            like["step"] = cpu.zeros((), dtype=steps.dtype)  # that of torch's default
+            like["step"] = cpu.zeros((), dtype=steps.dtype)  # as when the file was written
         check_like(f"{name}: of parameter {key}", entry, like)
 
 
 def _is_finite(number: float) -> bool:
     try:
         return math.isfinite(number)
-    except OverflowError:  # of an integer
+    except OverflowError:  # an integer above the range of floats
         return False
 
 

@@ -1,8 +1,8 @@
-"""Files and names of 0.1: where its classes are now, and how its checkpoints become those of today.
+"""Files and names of 0.1: present modules of its classes, and conversion of its checkpoints.
 
 A checkpoint of 0.1 is an archive of `torch.save` alone, without the record that `checkpoint.py`
-adds. Results of a simulation are kept as they were: this version rounds differently, and its tasks
-have other rewards.
+adds. Stored results of simulations are not recomputed: this version rounds differently, and the
+rewards of its tasks differ.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MODULES = {
     "sim.state": ("State",),
     "sim.surfaces": ("LinkSurfaces", "Surfaces"),
 }
-"""Module that files name, where there is none now -> its classes."""
+"""Removed module that files of 0.1 refer to -> its classes."""
 
 OPTIONS = {
     "actor_rate": "learning_rate",
@@ -34,16 +34,16 @@ OPTIONS = {
     "temperature_rate": "temperature_learning_rate",
     "trace": "gae_lambda",
 }
-"""Option of `TrainerOptions` -> its name now."""
+"""Option of `TrainerOptions` in 0.1 -> its present name."""
 
 
 def with_names_of_today(options: dict[str, Any]) -> dict[str, Any]:
-    """Options of a trainer under their names now."""
+    """Return options of a trainer under their present names."""
     return {OPTIONS.get(name, name): value for name, value in options.items()}
 
 
 def _descent(content: dict[str, Any]) -> dict[str, Any]:
-    """An optimization; evaluations did not measure the time of processors."""
+    """Convert an optimization; evaluations of 0.1 have no processor time."""
     found = content["found"]
     if found is None:
         return content
@@ -56,9 +56,9 @@ def _descent(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _trainer(content: dict[str, Any]) -> dict[str, Any]:
-    """A trainer, without its environments: they drew other starts.
+    """Convert a trainer, without its environments: 0.1 drew starts differently.
 
-    All observations were in the axes of the world.
+    Observations of 0.1 were all in the axes of the world.
     """
     return content | {
         "options": with_names_of_today(content["options"]),
@@ -69,7 +69,7 @@ def _trainer(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fit(content: dict[str, Any]) -> dict[str, Any]:
-    """A start of a fit, which had no ties, and priors of single numbers only."""
+    """Convert a start of a fit; 0.1 had no ties, and only priors of single numbers."""
     (names, kept, low, high, means, precisions), *rest = content["problem"]
     whitening = [
         [precision if column == row else 0.0 for column in range(len(precisions))]
@@ -84,4 +84,4 @@ CHECKPOINTS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "optimize": _descent,
     "trainer": _trainer,
 }
-"""Kind of a checkpoint -> the content of today, from the content of a file."""
+"""Kind of a checkpoint -> function from the content of a file of 0.1 to the present content."""

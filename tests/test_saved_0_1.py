@@ -1,4 +1,4 @@
-"""Files that 0.1 wrote, by save_checkpoints.py in data/, are gone on from."""
+"""Continuation from files of 0.1, which data/save_checkpoints.py wrote."""
 
 import functools
 import json
@@ -41,7 +41,7 @@ def apg(task, rate=0.004, **options):
 
 
 def changed(file, change):
-    """Replace a file of 0.1 by one of another content."""
+    """Change the content of a file of 0.1."""
     content = torch.load(file, weights_only=True)
     change(content)
     torch.save(content, file)
@@ -102,7 +102,7 @@ class TestTrainer:
 
 
 def test_a_policy_names_the_axes_that_it_has_learned_in(tmp_path):
-    """0.1 had those of the world alone; where a task has no frame, the two are one."""
+    """0.1 had world axes alone; for a task without its own frame both frames are equal."""
     apg("PushCube", frame="world").save(tmp_path / "world.pt")
     with pytest.raises(InvalidInput, match=r"of the world: make the task with frame='world'"):
         apg("PushCube").load(tmp_path / "world.pt")
@@ -121,7 +121,7 @@ class TestTraining:
         assert found["evaluations"][:2] == kept
         assert [each["updates"] for each in found["evaluations"]] == [0, 1, 2]
         assert found["config"]["trainer"]["learning_rate"] == 0.004
-        assert "nothing is left to do" in resume("train", folder).output  # now of today
+        assert "nothing is left to do" in resume("train", folder).output  # now in today's format
 
     def test_begins_where_no_policy_was_kept(self, files):
         folder = files / "train"
@@ -155,7 +155,7 @@ class TestFit:
         found = [r["seconds"] for r in again["records"] if r["kind"] == "residuals"]
         assert found[: len(seconds)] == seconds
         assert len(found) > len(seconds)
-        assert resume("fit", files / "fit").exit_code == 0  # now of today
+        assert resume("fit", files / "fit").exit_code == 0  # now in today's format
 
     def test_is_refused_where_the_simulation_differs(self, files):
         def differ(content):

@@ -1,4 +1,4 @@
-"""Folders of results that `fit` and `train` of 0.1 left, to go on from."""
+"""Folders of results of `fit` and `train` of 0.1, to resume from."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _LARGEST = 256 << 20  # bytes of a file
 
 
 def read_results(folder: Path, command: str) -> dict[str, Any]:
-    """The content of `resume.pt`, from the files of 0.1.
+    """Return the content of `resume.pt`, converted from files of 0.1.
 
     Args:
-        folder: The folder, with a file `RESUME`.
-        command: The command.
+        folder: Folder with a file `RESUME`.
+        command: Command that resumes, "fit" or "train".
 
     Raises:
-        InvalidInput: If a file is damaged, or is not of the command.
+        InvalidInput: If a file is damaged, or was written by another command.
         OSError: If a file cannot be read.
     """
     kept = _read_json(folder / RESUME)
@@ -41,7 +41,7 @@ def read_results(folder: Path, command: str) -> dict[str, Any]:
 
 
 def _training(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
-    """Configuration and results of a training; its evaluations end with the policy."""
+    """Return configuration and results of a training; drops evaluations after the saved policy."""
     options = with_names_of_today(config.get("trainer", {}))
     content = {"config": config | {"trainer": options}, "evaluations": [], "tried": []}
     if not (folder / _POLICY).is_file():

@@ -1,4 +1,4 @@
-"""Stages of a training before its updates: plans, and policies that imitate a teacher."""
+"""Stages of a training before the updates: plans, and policies that imitate a teacher."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["Stages"]
 
 
 class Stages:
-    """Stages that a training has done, and their results.
+    """Completed stages of a training, and their results.
 
-    A stage that is interrupted begins anew: its seed determines its bits.
+    An interrupted stage is repeated with the same bits, which its seed determines.
 
     Attributes:
-        done: Kind and duration [s] of each stage that is done; also the success of plans.
+        done: Kind and duration [s] of each completed stage; also the success of plans.
         policy: Policy of the last stage of the kind "imitate"; None before.
     """
 
@@ -39,12 +39,11 @@ class Stages:
         Args:
             stages: Stages of the configuration, without the updates of a trainer.
             make: Makes environments.
-            options: Options of the trainer, which shape the policy; their seed is the seed of all
-                stages.
+            options: Options of the trainer, which define the policy; all stages use their seed.
             workers: Workers that compute plans; None for this process.
         """
         self._stages, self._make, self._workers = stages, make, workers
-        # The bounds of fine-tuning do not shape a policy.
+        # The bounds of fine-tuning do not affect the networks of a policy.
         self._options = replace(options, max_change=None, held_out=None)
         self._plans: Plans | None = None
         self.done: list[dict[str, Any]] = []
@@ -52,14 +51,14 @@ class Stages:
 
     @property
     def seconds(self) -> float:
-        """Duration of the stages that are done."""
+        """Duration of the completed stages [s]."""
         return float(sum(each["seconds"] for each in self.done))
 
     def run(self, keep: Callable[[], None]) -> None:
-        """Do the stages that are left.
+        """Run the remaining stages.
 
         Args:
-            keep: Called after each stage.
+            keep: Function that is called after each stage, to save results.
         """
         for stage in self._stages[len(self.done) :]:
             before = time.perf_counter()
@@ -85,11 +84,12 @@ class Stages:
         """Continue after the stages of a record.
 
         Args:
-            kept: A record of `record`.
-            untrained: A policy of the same sizes and options.
+            kept: Result of `record`.
+            untrained: Policy of the same sizes and options; its weights are replaced by the
+                weights of the record, if the record has a policy.
 
         Raises:
-            InvalidInput: If it is no record of these stages.
+            InvalidInput: If `kept` is no record of these stages.
         """
         if not isinstance(kept, dict) or kept.keys() != self.record().keys():
             raise InvalidInput("`stages` must have the keys done, plans, policy")

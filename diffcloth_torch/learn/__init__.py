@@ -1,4 +1,4 @@
-"""Policies by gradients through the simulation, on one machine or on many.
+"""Policy optimization by gradients through the simulation, on one machine or on many.
 
 >>> from functools import partial
 >>> make = partial(dc.envs.make, "FoldCloth", size=12, opens_at=-1, reach=0.06)

@@ -12,21 +12,21 @@ from diffcloth_torch import cpu
 
 __all__ = ["TensorAdam"]
 
-_LEAST = 1e-8  # added to what gradients are divided by, as in Adam
+_LEAST = 1e-8  # added to the denominator, as in Adam
 
 
 class TensorAdam(torch.optim.Optimizer):
     """Adam whose second moment is the mean over all numbers of a tensor.
 
-    The rate is then that of a typical number of a tensor: what counts more moves faster, and what
-    hardly counts hardly moves, where Adam moves both at one speed. After Zhang et al., "Adam-mini:
-    Use Fewer Learning Rates To Gain More", ICLR 2025, with tensors as blocks.
+    One step size then serves a whole tensor: numbers with larger gradients move faster, whereas
+    Adam moves all numbers at about the same speed. After Zhang et al., "Adam-mini: Use Fewer
+    Learning Rates To Gain More", ICLR 2025, with tensors as blocks.
     """
 
     def __init__(
         self, groups: Iterable[dict[str, Any]], betas: tuple[float, float] = (0.9, 0.999)
     ) -> None:
-        """Take groups of parameters, each with its rate "lr"."""
+        """Initialize from groups of parameters, each with its learning rate "lr"."""
         super().__init__(groups, {"betas": betas})
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Data sets of episodes, in the files of Minari."""
+"""Data sets of episodes, in the format of Minari."""
 
 from __future__ import annotations
 
@@ -31,22 +31,23 @@ def record(
     *,
     seed: int = 0,
 ) -> Episodes:
-    """Follow a policy, and write its episodes as a data set of Minari, by the extra "data".
+    """Write episodes of a policy as a data set of Minari; requires the extra "data".
 
     `minari.MinariDataset(path)` reads it. Observations are float32 [T + 1, O], actions float32
-    [T, A] within [-1, 1], `infos` "success", "failed" and "blocked" bool [T + 1]; the metadata has
-    the seed of the start of each episode, as for `env.reset(seed=[...])`, and the name of the task.
+    [T, A] within [-1, 1], `infos` "success", "failed" and "blocked" bool [T + 1]. The metadata
+    contains the seed of the start of each episode, for `env.reset(seed=[...])`, and the name of the
+    task.
 
     Args:
         make: Makes environments, as for `evaluate`.
         policy: A function of observations, or "scripted", as for `evaluate`.
-        episodes: Their number.
-        path: Folder of the data set, which must not exist or be empty. It appears when all is
-            written, or not at all.
-        seed: Of the starts.
+        episodes: Number of episodes.
+        path: Folder of the data set, which must not exist or must be empty. It is created
+            completely, after all episodes, or not at all.
+        seed: Seed of the starts.
 
     Returns:
-        How well the policy did.
+        Results of the episodes.
 
     Raises:
         InvalidInput: If an argument is not accepted, or Minari is not installed.
@@ -73,7 +74,7 @@ def record(
 
 
 class _DataSet:
-    """A data set that is being written."""
+    """Writer of a data set."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._count = path, 0
@@ -88,7 +89,7 @@ class _DataSet:
         running = torch.stack([step.running for step in steps])
         buffers = []
         for i, seed in enumerate(seeds):
-            # An episode runs from its start to its end without a gap.
+            # The running steps of an environment are a prefix of all steps.
             own = steps[: int(running[:, i].sum())]
 
             def rows(name: str, own: list[Step] = own, i: int = i) -> Any:

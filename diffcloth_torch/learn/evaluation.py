@@ -1,4 +1,4 @@
-"""How well a policy does in episodes from fresh starts, each of which has a seed of its own."""
+"""Evaluation of policies in episodes from fresh starts, each with its own seed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = [
 Acts = Callable[[Tensor], Any] | str
 """A function of observations [B, O] that returns actions [B, A], or "scripted"."""
 
-_LARGEST_EPISODES = 10**6  # more than of a day
+_LARGEST_EPISODES = 10**6  # more than can be computed in a day
 _CHUNK = 8  # environments that step together
 _LARGEST_SEED = 2**64 - 1
 _SCRIPTED = ("scripted",)
@@ -52,18 +52,18 @@ _QUANTILE = 1.959963984540054  # of the normal distribution, for 95 %
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episodes:
-    """Episodes of a policy.
+    """Results of episodes of a policy.
 
-    The length of it is E, the number of episodes.
+    `len` returns E, the number of episodes.
 
     Attributes:
         returns: Sum of the rewards of each episode, float32 [E].
-        success: Whether the task was done at the end, bool [E].
-        ever: Whether it was done, and held, at any time, bool [E].
-        failed: Whether the simulation failed, which ends an episode, bool [E].
-        blocked: Whether a motion was infeasible, and was not made, bool [E].
-        steps: Environment steps of all episodes.
-        seeds: Of the starts [E]: `env.reset(seed=seeds[:8])` begins the first eight episodes.
+        success: True if the episode ended in success, bool [E].
+        ever: True if the episode was successful at any step, bool [E].
+        failed: True if the simulation failed, which ends an episode, bool [E].
+        blocked: True if an infeasible motion was blocked, bool [E].
+        steps: Number of environment steps of all episodes.
+        seeds: Seeds of the starts [E]: `env.reset(seed=seeds[:8])` begins the first eight episodes.
     """
 
     returns: Tensor
@@ -89,7 +89,7 @@ class Episodes:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Confidence interval of the probability of success, 95 %.
+        """Wilson confidence interval of the probability of success, 95 %.
 
         Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", Journal of
         the American Statistical Association 22 (1927).
@@ -120,31 +120,31 @@ def evaluate(
     *,
     workers: Workers | None = None,
 ) -> Episodes:
-    """Follow a policy in episodes from fresh starts.
+    """Evaluate a policy in episodes from fresh starts.
 
-    Episode i has a start of its own, by the seed and i alone, and the same bits whatever the number
-    of episodes and whoever computes it. What a policy learned from are other starts, unless it was
-    trained from these seeds.
+    The start of episode i depends on the seed and on i alone; the episode has the same bits for any
+    number of episodes and any workers. These starts differ from the starts of a training, unless it
+    used the same seeds.
 
     Args:
         make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7)`.
         policy: A function of observations, float32 [1, O], that returns actions [1, A], such as a
-            `Policy`; or "scripted" for the policy of the task made by hand. Policies that remember
-            earlier observations are not accepted: episodes take turns.
-        episodes: E, their number.
-        seed: Of their starts.
-        workers: What computes the episodes; None computes them here. `make` and `policy` must then
-            be such as can be pickled.
+            `Policy`; or "scripted" for the handwritten policy of the task. Policies must not depend
+            on earlier observations: steps of several episodes alternate.
+        episodes: E, the number of episodes.
+        seed: Seed from which the seeds of the starts derive.
+        workers: Workers that compute the episodes, to which `make` and `policy` are pickled; None:
+            this process.
 
     Raises:
-        InvalidInput: If an argument is not accepted, or the actions have another shape.
+        InvalidInput: If an argument is not accepted, or the shape of the actions is wrong.
     """
     seeds = seeds_of("evaluate", seed, episodes)
     return evaluate_starts("evaluate", make, policy, seeds, workers=workers)
 
 
 def seeds_of(owner: str, seed: int, episodes: int) -> list[int]:
-    """The seeds of the starts of episodes, of checked arguments."""
+    """Check arguments, and return the seeds of the starts of episodes."""
     check_count(f"{owner}: `episodes`", episodes, 1, _LARGEST_EPISODES)
     check_count(f"{owner}: `seed`", seed, 0, _LARGEST_SEED)
     return episode_seeds(seed, episodes)
@@ -159,15 +159,15 @@ def evaluate_starts(
     workers: Workers | None = None,
     note: Note | None = None,
 ) -> Episodes:
-    """Follow a policy from starts by their seeds; see `evaluate`.
+    """Evaluate a policy from the starts of given seeds; see `evaluate`.
 
     Args:
-        owner: Opens messages.
+        owner: Prefix of messages.
         make: As for `evaluate`.
-        policy: Likewise.
-        seeds: Of the starts, one for each episode.
+        policy: As for `evaluate`.
+        seeds: Seeds of the starts, one for each episode.
         workers: As for `evaluate`.
-        note: Called with the environments, the seeds and the steps of each chunk; not with
+        note: Called with the environments, the seeds and the steps of each chunk; unused with
             `workers`.
     """
     if not callable(make):
@@ -202,15 +202,15 @@ def evaluate_starts(
 def follow(
     env: ClothVectorEnv, act: Callable[[Tensor], Tensor], seed: int | Sequence[int]
 ) -> tuple[Tensor, Tensor, list[State]]:
-    """Follow actions from starts, and keep the states.
+    """Run episodes, and keep the states.
 
     Args:
         env: Environments, which are reset.
-        act: Actions [B, A] for observations [B, O].
-        seed: Of the reset.
+        act: Function that returns actions [B, A] for observations [B, O].
+        seed: Seed of the reset.
 
     Returns:
-        Returns [B], successes [B], and the states of all episodes until the first of them ends.
+        Returns [B], successes [B], and the states of all episodes until the first episode ends.
     """
     observation, _ = env.reset(seed=seed)
     total = cpu.zeros(env.num_envs, dtype=torch.float32)
@@ -229,14 +229,14 @@ class Step:
     """A transition of all environments.
 
     Attributes:
-        seen: Observations before it [B, O].
-        actions: [B, A].
-        reward: [B].
-        after: Observations after it, before a new start [B, O].
-        terminated: Whether it ended an episode before the horizon [B].
-        truncated: Whether the horizon ended it [B].
-        flags: "success", "failed" and "blocked" after it, before a new start, [B] each.
-        running: Whether the first episode of an environment was not over before it [B].
+        seen: Observations before the transition [B, O].
+        actions: Actions [B, A].
+        reward: Rewards [B].
+        after: Observations after the transition, before a new start [B, O].
+        terminated: True if the transition ended an episode before the horizon [B].
+        truncated: True if the horizon ended an episode [B].
+        flags: "success", "failed" and "blocked" after the transition, before a new start, [B] each.
+        running: True if the first episode of the environment ran before the transition [B].
     """
 
     seen: Tensor
@@ -250,7 +250,7 @@ class Step:
 
     @property
     def goes_on(self) -> Tensor:
-        """Whether the first episode of an environment is not over after it [B]."""
+        """True if the first episode of the environment runs after the transition [B]."""
         return self.running & ~(self.terminated | self.truncated)
 
 
@@ -260,12 +260,12 @@ Note = Callable[[ClothVectorEnv, tuple[int, ...], list[Step]], None]
 def steps_of(
     env: ClothVectorEnv, act: Callable[[Tensor], Tensor], observation: Tensor
 ) -> Iterator[Step]:
-    """Follow actions until each environment has ended an episode.
+    """Yield transitions until each environment has ended an episode.
 
     Args:
         env: Environments at the start of their episodes.
-        act: Actions [B, A] for observations [B, O].
-        observation: The first one, of `env.reset`.
+        act: Function that returns actions [B, A] for observations [B, O].
+        observation: Initial observation, returned by `env.reset`.
     """
     running = cpu.ones(env.num_envs, dtype=torch.bool)
     while bool(running.any()):
@@ -280,9 +280,10 @@ def steps_of(
 
 
 def acting(owner: str, env: ClothVectorEnv, policy: Acts) -> Callable[[Tensor], Tensor]:
-    """Actions [B, A] by a policy for observations [B, O] of environments, checked.
+    """Return a function that computes checked actions [B, A] for observations [B, O].
 
-    The policy computes one row at a time, as products of matrices round by their number of rows.
+    The policy computes one row at a time, as rounding of matrix products depends on the number of
+    rows.
     """
     if isinstance(policy, str):
         return lambda _: env.scripted_actions()
@@ -310,7 +311,7 @@ def _rows(
     seeds: tuple[int, ...],
     note: Note | None = None,
 ) -> dict[str, Tensor]:
-    """The rows of `Episodes`, and the lengths of the episodes."""
+    """Compute the tensors of `Episodes`, and the lengths of the episodes."""
     count = len(seeds)
     rows = {name: cpu.zeros(count, dtype=torch.bool) for name in _ROWS}
     rows["returns"] = cpu.zeros(count, dtype=torch.float32)

@@ -1,7 +1,7 @@
-"""Fine-tuning of a policy: a bound on the actions that an update changes, and checked policies.
+"""Fine-tuning of a policy: a trust region for updates, and checks at held-out starts.
 
-A few updates without a bound can unlearn what a policy does well: its weights move all actions of
-an episode at once.
+A few unbounded updates can degrade a good policy, as its weights affect all actions of an episode
+at once.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from diffcloth_torch.learn.policy import Policy
 
 __all__ = ["Kept", "TrustRegion", "for_fine_tuning"]
 
-_MAX_CHANGE = 0.02  # of actions; 0.1 in each one of an episode of FoldCloth moves a picker by 9 cm
+_MAX_CHANGE = 0.02  # 0.1 in each action of a FoldCloth episode moves a picker by 9 cm
 _HELD_OUT = 16
 _HALVINGS = 20
-_RESTORED = ("actor", "scale")  # parts of a policy on which its actions depend
+_RESTORED = ("actor", "scale")  # parts of a policy on which actions depend
 
 
 def for_fine_tuning(options: TrainerOptions) -> TrainerOptions:
-    """Options with the bounds of fine-tuning where none are given."""
+    """Return options in which missing bounds have the defaults of fine-tuning."""
     return replace(
         options,
         max_change=_MAX_CHANGE if options.max_change is None else options.max_change,
@@ -36,15 +36,15 @@ def for_fine_tuning(options: TrainerOptions) -> TrainerOptions:
 
 
 class TrustRegion:
-    """The weights of a policy around which an update may change actions only so far."""
+    """Bound on the change of actions by an update of a policy."""
 
     def __init__(self, policy: Policy, seen: Tensor, largest: float) -> None:
-        """Note the weights before an update.
+        """Store the weights before an update.
 
         Args:
             policy: The policy.
             seen: Observations [n, O] in which actions are compared.
-            largest: Root mean square of the changes of actions without noise.
+            largest: Largest root mean square of the changes of actions without noise.
         """
         self._policy, self._seen, self._largest = policy, seen, largest
         self._parameters = list(policy.actor.parameters())
@@ -53,10 +53,10 @@ class TrustRegion:
 
     @torch.no_grad()
     def limit(self) -> tuple[float, float]:
-        """Move the weights back towards those before, until actions change no more than they may.
+        """Scale the update of the weights back, by bisection, until the bound holds.
 
         Returns:
-            The change of the actions, and the share of the update that is left, found by bisection.
+            The change of the actions, and the remaining share of the update.
         """
         moved = [p.detach().clone() for p in self._parameters]
         change = self._change()
@@ -88,12 +88,12 @@ class TrustRegion:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A policy whose success at the held-out starts is known, to which a training returns.
+    """The last policy that passed a check at the held-out starts; restored if a later one fails.
 
     Attributes:
-        updates: After which it was there.
-        success: Its share of successes.
-        weights: Of its actor, and its scale.
+        updates: Number of updates at the check.
+        success: Share of successes.
+        weights: Weights of the actor, and the scale of observations.
         steps: State of the optimizer of the actor.
     """
 
@@ -104,7 +104,7 @@ class Kept:
 
     @staticmethod
     def weights_of(policy: Policy) -> dict[str, Tensor]:
-        """Copies of the weights on which actions depend."""
+        """Return copies of the weights on which actions depend."""
         return {
             name: tensor.detach().clone()
             for name, tensor in policy.state_dict().items()
@@ -112,19 +112,19 @@ class Kept:
         }
 
     def restore(self, policy: Policy, optimizer: torch.optim.Optimizer) -> None:
-        """Return a policy and its optimizer to this state."""
+        """Restore this state of a policy and its optimizer."""
         policy.load_state_dict(self.weights, strict=False)
-        # A copy, as the optimizer goes on to change its tensors in place.
+        # A copy, as steps of the optimizer change its state in place.
         optimizer.load_state_dict(copy.deepcopy(self.steps))
 
     @staticmethod
     def checked(
         owner: str, given: Any, policy: Policy, optimizer: torch.optim.Optimizer, updates: int
     ) -> Kept:
-        """Check the fields of a file.
+        """Return a `Kept` from the fields of a file, after checks.
 
         Raises:
-            InvalidInput: If they are not those of a `Kept` of this policy and optimizer.
+            InvalidInput: If the fields do not match this policy and optimizer.
         """
         example = {"updates": 0, "success": 0.0, "weights": Kept.weights_of(policy)}
         if not isinstance(given, dict) or given.keys() != {*example, "steps"}:

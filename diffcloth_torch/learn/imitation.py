@@ -1,4 +1,4 @@
-"""Policies that imitate a teacher in the states that they visit themselves.
+"""Policies that imitate a teacher in the states that the policies visit.
 
 Reference: Ross, Gordon, Bagnell, "A Reduction of Imitation Learning and Structured Prediction to
 No-Regret Online Learning", AISTATS 2011 (DAgger).
@@ -31,11 +31,11 @@ Teacher = Callable[[Tensor, ClothVectorEnv], Tensor]
 """A function of observations [B, O] and environments that returns actions [B, A]."""
 
 OPTIONS = TrainerOptions("apg", plan_knots=12, hidden=(128, 128), init_std=0.05)
-"""Options that shape a policy that imitates, by default."""
+"""Default options, which define the networks of a policy."""
 
-_NOISE = 0.1  # standard deviation of the noise on the actions of a teacher that drives
-_NOISY = 0.5  # share of them that have noise
-_RATE = 3e-3  # of Adam at first; it falls to 0 along a cosine
+_NOISE = 0.1  # standard deviation of the noise on the actions of a teacher in the first round
+_NOISY = 0.5  # share of these actions that have noise
+_RATE = 3e-3  # initial learning rate of Adam; it falls to 0 along a cosine
 _BATCH = 256
 
 
@@ -56,28 +56,29 @@ def imitate(
     policy acts, without noise. The teacher labels each observation with its action, and after each
     round the policy is fitted to all labels so far, by mean squared error.
 
-    Plans that teach are followed in the first round. In a later round the policy acts from new
-    starts, and at some times of an episode the rest of it is planned again, by a few gradient
-    iterations from the nearest plan; see `Replanning`.
+    If the teacher is a set of plans, the first round follows the plans. In a later round the policy
+    acts from new starts, and at some times of an episode the remaining actions are planned anew, by
+    a few gradient iterations from the nearest plan; see `Replanning`.
 
     Args:
         make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7)`.
-        teacher: "scripted" for the policy made by hand of the task, plans of `dc.learn.plan` for
+        teacher: "scripted" for the handwritten policy of the task, plans of `dc.learn.plan` for
             the same task, or a function of observations [B, O] and environments that returns
             actions [B, A], between -1 and 1.
         rounds: Number of rounds.
         episodes: Number of episodes of a round.
         seed: Seed of the starts, of the noise, of the networks and of the fit.
         iterations: Steps of Adam after each round.
-        options: Its `hidden`, `plan_knots`, `init_std` and `first_action` shape the policy, so
-            that a trainer with the same ones can go on. None takes (128, 128), 12 and .05.
+        options: Options whose `hidden`, `plan_knots`, `init_std` and `first_action` define the
+            policy; a trainer with equal values can continue from it. None: (128, 128), 12, .05 and
+            None.
 
     Returns:
-        The policy. Its observations are scaled by those of the first round.
+        The policy. The scale of its observations is computed from the first round.
 
     Raises:
         InvalidInput: If an argument is not accepted, or the teacher returns actions that are not
-            finite or have another shape.
+            finite or have a wrong shape.
     """
     if not callable(make):
         raise TypeError(f"imitate: `make` must be a function that makes environments, got {make!r}")
@@ -118,14 +119,14 @@ def imitate(
 def fit(
     policy: Policy, seen: Tensor, shown: Tensor, iterations: int, draws: torch.Generator
 ) -> float:
-    """Fit the actor to actions [n, A] of observations [n, O]; returns the last loss.
+    """Fit the actor to actions [n, A] of observations [n, O]; return the last loss.
 
     Args:
-        policy: Its actor is changed.
+        policy: Policy whose actor is updated.
         seen: Observations.
         shown: Actions.
-        iterations: Steps of Adam.
-        draws: Draws the batches.
+        iterations: Number of steps of Adam.
+        draws: Generator that draws the batches.
     """
     adam = torch.optim.Adam(policy.actor.parameters(), lr=_RATE)
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, iterations)
@@ -135,7 +136,7 @@ def fit(
         loss = (policy(seen[rows]) - shown[rows]).square().mean()
         adam.zero_grad()
         loss.backward()
-        with cpu.DEVICE:  # where Adam keeps its counts
+        with cpu.DEVICE:  # device of the step counts of Adam
             adam.step()
         rates.step()
     return float(loss.detach())
@@ -160,7 +161,7 @@ def _checked_teacher(teacher: Any) -> Plans | Teacher:
 
 
 class _Labels:
-    """Lessons from a teacher that can act anywhere."""
+    """Lessons from a teacher that can act in every state."""
 
     def __init__(
         self, env: ClothVectorEnv, teacher: Teacher, seed: int, draws: torch.Generator
@@ -168,7 +169,7 @@ class _Labels:
         self._env, self._teacher, self._seed, self._draws = env, teacher, seed, draws
 
     def round(self, policy: Policy, number: int) -> tuple[Tensor, Tensor]:
-        """Observations [n, O] of an episode of each environment, and the labels [n, A]."""
+        """Return observations [n, O] of one episode of each environment, and labels [n, A]."""
         env = self._env
         observation, _ = env.reset(seed=part_seeds(self._seed, number, env.num_envs))
         running = cpu.ones(env.num_envs, dtype=torch.bool)
@@ -184,7 +185,7 @@ class _Labels:
 
 
 def _label(teacher: Teacher, observation: Tensor, env: ClothVectorEnv) -> Tensor:
-    """The teacher's actions [B, A], float32."""
+    """Return the checked actions of the teacher, float32 [B, A]."""
     name = "imitate: actions of `teacher`"
     actions = float_tensor(name, teacher(observation, env)).detach()
     check_shape(name, actions.shape, [(env.num_envs, env.task.action_size)])
@@ -195,7 +196,7 @@ def _label(teacher: Teacher, observation: Tensor, env: ClothVectorEnv) -> Tensor
 
 
 def _noisy(actions: Tensor, generator: torch.Generator) -> Tensor:
-    """Actions [B, A] of which half have noise."""
+    """Add noise to half of the rows of actions [B, A], chosen at random."""
     noise = _NOISE * cpu.randn(*actions.shape, generator=generator, dtype=actions.dtype)
     chosen = cpu.rand(len(actions), 1, generator=generator) < _NOISY
     return (actions + noise * chosen).clamp(-1, 1)

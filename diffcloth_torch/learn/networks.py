@@ -15,11 +15,11 @@ from diffcloth_torch import cpu
 
 __all__ = ["Actor", "Critics", "Plan", "Scale"]
 
-_LIMIT = 5.0  # of a scaled observation
-_QUIET = 0.01  # share of the weights of a last layer that is left at first
-_WIDEST = 2.0  # of the logarithm of a width: how far what is seen changes it
-_LEAST = 1e-2  # standard deviation that observations are divided by
-# As observations, whatever torch's defaults are.
+_LIMIT = 5.0  # bound on the magnitude of a scaled observation
+_QUIET = 0.01  # factor on the initial weights of a last layer
+_WIDEST = 2.0  # largest change of a log deviation by the observation
+_LEAST = 1e-2  # smallest standard deviation by which observations are divided
+# Device and dtype of observations, independent of torch's defaults.
 _KIND: dict[str, Any] = {"device": cpu.DEVICE, "dtype": torch.float32}
 
 
@@ -32,7 +32,7 @@ def _layers(sizes: Sequence[int], outputs: int) -> nn.Sequential:
 
 
 def _quieten(layers: nn.Module) -> Tensor:
-    """Make the last layer nearly constant; gives its bias."""
+    """Make the output of the last layer nearly constant, and return its bias."""
     assert isinstance(layers, nn.Sequential)
     last = layers[-1]
     assert isinstance(last, nn.Linear)
@@ -42,21 +42,21 @@ def _quieten(layers: nn.Module) -> Tensor:
 
 
 class Plan(nn.Module):
-    """Actions over the time of an episode, and how they follow what is seen, linearly.
+    """Actions over the time of an episode, plus a linear function of observations.
 
     Attributes:
-        knots: Actions before their tanh [K, A] at even times, with lines between them.
-        gains: How they change with scaled observations [A, O].
+        knots: Actions before tanh [K, A] at evenly spaced times, interpolated linearly.
+        gains: Derivatives of actions before tanh by scaled observations [A, O].
     """
 
     def __init__(self, observations: int, first: Tensor, knots: int) -> None:
-        """Make a plan that is `first` [A] at all times, whatever is seen."""
+        """Make a plan that returns `first` [A] for all times and observations."""
         super().__init__()
         self.knots = nn.Parameter(first.repeat(knots, 1))
         self.gains = nn.Parameter(cpu.zeros(len(first), observations, dtype=torch.float32))
 
     def forward(self, scaled: Tensor, time: Tensor) -> Tensor:
-        """Actions before their tanh [B, A] for observations [B, O] at times in [0, 1], [B]."""
+        """Return actions before tanh [B, A] for observations [B, O] at times in [0, 1], [B]."""
         count = len(self.knots)
         away = time[:, None] * (count - 1) - cpu.arange(count)
         shares = (1 - away.abs()).clamp(min=0)
@@ -67,10 +67,10 @@ class Plan(nn.Module):
 class Actor(nn.Module):
     """A policy: the tanh of a normal distribution.
 
-    The width of the distribution is the same everywhere, or else also depends on what is seen.
+    The standard deviation is constant, or depends on the observation.
 
     Attributes:
-        plan: What is added to the network's actions; None for nothing.
+        plan: Plan that is added to the output of the network; None: no plan.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Actor(nn.Module):
         sees_width: bool,
         knots: int = 0,
     ) -> None:
-        """Make a policy whose actions are nearly the first one [A], but for noise."""
+        """Make a policy whose actions without noise are nearly the first action [A]."""
         super().__init__()
         self._size = len(first_action)
         self.layers = _layers([observations, *hidden], (2 if sees_width else 1) * self._size)
@@ -95,12 +95,12 @@ class Actor(nn.Module):
     def forward(
         self, scaled: Tensor, noise: Tensor, time: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Actions and their entropy.
+        """Compute actions and their entropy.
 
         Args:
             scaled: Observations [B, O].
             noise: Standard normal [B, A]; zeros give the actions of a policy without noise.
-            time: Share of the episode that has passed [B]; where there is a plan.
+            time: Elapsed share of the episode [B]; used by the plan alone.
 
         Returns:
             Actions [B, A], and minus the logarithm of their density [B], whose mean is the entropy.
@@ -112,29 +112,29 @@ class Actor(nn.Module):
         for width in widths:
             log_deviation = log_deviation + _WIDEST * width.tanh()
         before = mean + log_deviation.exp() * noise
-        # The slope of tanh, 1 - tanh^2 = 4 / (e^x + e^-x)^2, also where it is nearly 0.
+        # Logarithm of the slope of tanh, 1 - tanh^2 = 4 / (e^x + e^-x)^2, also if nearly 0.
         log_slope = 2 * (math.log(2.0) - before - softplus(-2 * before))
         entropy = 0.5 * noise.square() + 0.5 * math.log(2 * math.pi) + log_deviation + log_slope
         return before.tanh(), entropy.sum(dim=-1)
 
 
 class Critics(nn.Module):
-    """Several opinions on the value of a state."""
+    """Several estimates of the value of a state."""
 
     def __init__(self, observations: int, hidden: Sequence[int], count: int) -> None:
-        """Make critics that know of no difference between states, so that they have no gradient."""
+        """Make critics that are nearly constant, so that their initial gradient is nearly zero."""
         super().__init__()
         self.values = nn.ModuleList(_layers([observations, *hidden], 1) for _ in range(count))
         for value in self.values:
             _quieten(value)
 
     def forward(self, scaled: Tensor) -> Tensor:
-        """Values [critics, ...] of observations [..., O]."""
+        """Return values [critics, ...] of observations [..., O]."""
         return torch.stack([value(scaled)[..., 0] for value in self.values])
 
 
 class Scale(nn.Module):
-    """Brings observations to mean 0 and deviation 1, by all that have been seen."""
+    """Scale of observations to mean 0 and deviation 1, by the statistics of all seen so far."""
 
     def __init__(self, observations: int) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class Scale(nn.Module):
         self.square: Tensor
 
     def see(self, observations: Tensor) -> None:
-        """Take note of observations [n, O]."""
+        """Add observations [n, O] to the statistics."""
         rows = observations.detach()
         self.count += len(rows)
         share = float(len(rows) / self.count)
@@ -154,6 +154,6 @@ class Scale(nn.Module):
         self.square += share * (rows.square().mean(dim=0) - self.square)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Scaled observations [..., O]."""
+        """Return scaled observations [..., O]."""
         deviation = (self.square - self.mean.square()).clamp(min=_LEAST**2).sqrt()
         return ((observations - self.mean) / deviation).clamp(-_LIMIT, _LIMIT)

@@ -1,4 +1,4 @@
-"""How a policy is learned."""
+"""Options of a training."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["ALGORITHMS", "SCALES", "TrainerOptions", "name_now"]
 ALGORITHMS = ("apg", "shac", "sapo")
 SCALES = ("number", "tensor")
 _LEAST_SHARE = 0.1
-_LARGEST_COUNT = 10**6  # of what each update repeats
-_LARGEST = 1e6  # above every sensible rate
+_LARGEST_COUNT = 10**6  # of steps, epochs, batches, critics, starts, updates
+_LARGEST = 1e6  # above every sensible value
 _POSITIVE = (
     "learning_rate", "plan_learning_rate", "critic_learning_rate", "temperature_learning_rate",
     "max_grad_norm", "init_std", "temperature",
@@ -26,12 +26,12 @@ _POSITIVE = (
 
 
 def name_now(name: str) -> str:
-    """Text that follows the message of an unknown option: its name since 0.2.0, if it has one."""
+    """Return a suffix for the message of an unknown option: its name since 0.2.0, or nothing."""
     return f"; since 0.2.0 its name is `{OPTIONS[name]}`" if name in OPTIONS else ""
 
 
 class _RefusesOldNames:
-    """Refuses names that options had in 0.1, and reports the names of today."""
+    """Base class that refuses names of options of 0.1, and reports the present names."""
 
     def __new__(cls, *_: object, **options: object) -> _RefusesOldNames:
         for name in options:
@@ -48,56 +48,57 @@ class _RefusesOldNames:
 
 @dataclass(frozen=True)
 class TrainerOptions(_RefusesOldNames):
-    """How a policy is learned.
+    """Options of a training.
 
     Attributes:
-        algorithm: "apg": the rewards of a rollout alone. "shac": also the value of its end, by a
-            critic that learns beside the policy. "sapo": also the entropy of the policy, whose
-            noise depends on what it sees, and several critics.
-        horizon: Steps of a rollout that is differentiated at once.
-        feedback: Whether gradients flow through what the policy sees, too. Without, each action is
-            differentiated as that of a plan: where a plan cannot be improved the policy cannot
-            either, and what a policy sees does not multiply gradients step by step.
-        discount: Of rewards from step to step, gamma.
-        gae_lambda: Of lambda returns, lambda.
+        algorithm: "apg": the rewards of a rollout alone. "shac": also the value of the last state,
+            estimated by a critic that is learned beside the policy. "sapo": also the entropy of the
+            policy, with noise that depends on observations, and several critics.
+        horizon: Steps of a rollout, which is differentiated as a whole.
+        feedback: If true, gradients also flow through the observations of the policy. If false,
+            each action is differentiated like an action of a plan: a policy is stationary if its
+            plan is, and observations do not multiply gradients step by step.
+        discount: Discount factor of rewards from step to step, gamma.
+        gae_lambda: Lambda of lambda returns.
         learning_rate: Learning rate of Adam for the policy.
-        critic_learning_rate: The same for the critic.
-        decay_updates: Number of updates over which these and `plan_learning_rate` fall, linearly,
-            to a tenth; 0 for never.
-        scale: What Adam divides the steps of the policy by. "number": a scale for each number, as
-            usual, so that all of them move equally fast. "tensor": one scale for all numbers of a
-            tensor, such as the knots of a plan, so that what counts little moves little.
-        betas: Of Adam for all of them.
-        critic_epochs: How often the critic sees each rollout.
-        critic_batches: Parts of a rollout between two steps of the critic.
-        critic_only: Updates at first that improve the critic alone.
-        tau: Polyak rate: share by which the target critic moves towards the critic after each
+        critic_learning_rate: Learning rate of Adam for the critics.
+        decay_updates: Number of updates over which `learning_rate`, `critic_learning_rate` and
+            `plan_learning_rate` fall linearly to a tenth; 0: constant rates.
+        scale: Block over which Adam averages squared gradients of the policy. "number": each number
+            has its own scale, as usual, and all numbers move about equally fast. "tensor": one
+            scale for all numbers of a tensor, such as the knots of a plan; numbers with small
+            gradients move little.
+        betas: Decay rates of the moments of all Adam optimizers.
+        critic_epochs: Passes of the critics over each rollout.
+        critic_batches: Batches of a pass, each with one step of the critics.
+        critic_only: Number of first updates that improve the critics alone.
+        tau: Polyak rate: share by which the target critics move towards the critics after each
             rollout.
-        max_grad_norm: Largest norm of a gradient of the policy; longer ones are shortened.
-        init_std: Standard deviation of the noise of actions at first.
-        critics: Number of critics of "sapo": their mean is the value that a policy climbs, their
-            least one the value that they learn.
-        temperature: Of "sapo" at first: what a unit of entropy is worth, in units of reward.
-        temperature_learning_rate: Learning rate of Adam for its logarithm.
-        target_entropy: Mean entropy, per number of an action, that the temperature aims at.
-        first_action: Action of the policy at first, between -1 and 1; None for zeros.
-        plan_knots: Number of actions, at even times of an episode and with lines between them, that
-            are learned as a plan. A policy is then the sum of that plan, of a linear function of
-            what it sees, and of its network. The task must observe its "time". 0 for the network
-            alone.
-        plan_learning_rate: Learning rate of Adam for the plan; the linear function has the rate of
-            the policy.
+        max_grad_norm: Largest norm of a gradient of the policy; longer ones are clipped.
+        init_std: Initial standard deviation of the noise of actions.
+        critics: Number of critics of "sapo": the policy maximizes the mean over critics, and the
+            critics learn from the minimum over critics.
+        temperature: Initial temperature of "sapo": reward that equals one unit of entropy.
+        temperature_learning_rate: Learning rate of Adam for the logarithm of the temperature.
+        target_entropy: Mean entropy, per number of an action, to which the temperature is adapted.
+        first_action: Initial action of the policy, between -1 and 1; None for zeros.
+        plan_knots: Number of actions, at evenly spaced times of an episode and interpolated
+            linearly, that are learned as a plan. A policy is then the sum of the plan, a linear
+            function of the observation, and the network. The task must observe its "time". 0: the
+            network alone.
+        plan_learning_rate: Learning rate of Adam for the plan; the linear function has the learning
+            rate of the policy.
         hidden: Sizes of hidden layers.
         max_change: Largest change of actions by an update: root mean square, without noise, over
-            the observations of the rollout. A larger update is scaled back, and the scale of
-            observations, on which actions depend, too, stays as it was after the first update or in
-            the policy that training begins at. None: 0.02 for a training that begins at a policy,
-            otherwise no bound. As actions lie between -1 and 1, 2 bounds no update.
-        held_out: Number of starts, which no rollout has, at which the policy is checked at first
-            and after every `check_every` updates: where success there has fallen, the policy is
+            the observations of the rollout. A larger update is scaled back. The scale of
+            observations, on which actions also depend, remains fixed after the first update, or as
+            in the initial policy. None: 0.02 for a training that begins at a policy, otherwise no
+            bound. Actions lie between -1 and 1, so 2 bounds no update.
+        held_out: Number of starts, excluded from rollouts, at which the policy is checked initially
+            and after every `check_every` updates; if success has fallen, the last good policy is
             restored. None: 16 for a training that begins at a policy, otherwise 0; 0: no checks.
         check_every: Updates from one check to the next.
-        seed: Of networks, noise and starts.
+        seed: Seed of networks, noise and starts.
 
     Raises:
         InvalidInput: If a value is not accepted.
@@ -168,16 +169,16 @@ class TrainerOptions(_RefusesOldNames):
 
     @property
     def has_critic(self) -> bool:
-        """Whether a critic says what the end of a rollout is worth."""
+        """Return whether a critic estimates the value of the end of a rollout."""
         return self.algorithm != "apg"
 
     @property
     def has_entropy(self) -> bool:
-        """Whether the entropy of the policy counts, too."""
+        """Return whether the loss includes the entropy of the policy."""
         return self.algorithm == "sapo"
 
     def rate_share(self, updates: int) -> float:
-        """Share of the learning rates that is left after some updates."""
+        """Return the factor on the learning rates after some updates."""
         if self.decay_updates == 0:
             return 1.0
         return 1.0 - (1.0 - _LEAST_SHARE) * min(updates / self.decay_updates, 1.0)

@@ -1,7 +1,8 @@
-"""Plans: actions of whole episodes, by gradients, one for each of several starts.
+"""Plans: actions of whole episodes, optimized by gradients, one plan for each of several starts.
 
-A plan is the tanh of hat functions of the time. Starts do not depend on each other: a piece of work
-is the plans of some starts, and its results have the same bits wherever it is computed.
+A plan is the tanh of a sum of hat functions of the time. Starts do not depend on each other: a
+piece of work comprises the plans of some starts, and its results have the same bits in every
+process.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from diffcloth_torch.operations import called
 
 __all__ = ["Improved", "Plans", "improve", "knots_of", "plan"]
 
-_CHECKPOINT = "plans"  # kind of its files
+_CHECKPOINT = "plans"  # kind of the files of `Plans.save`
 _TOGETHER = 2  # starts of a piece
-_BETAS = (0.9, 0.95)  # of Adam
-_RATE, _LAST_SHARE = 0.1, 0.1  # its learning rate at first, and the share of it at last
-_NOISE = 0.2  # standard deviation of the first noise of knots
+_BETAS = (0.9, 0.95)  # decay rates of Adam
+_RATE, _LAST_SHARE = 0.1, 0.1  # initial learning rate of Adam, and its final share
+_NOISE = 0.2  # standard deviation of the noise of initial knots
 _LARGEST_KNOT = 0.995  # first actions are clipped to this before atanh
-_SHARE = 3  # plans that begin from good ones take the iterations over this
+_SHARE = 3  # divides iterations and rate of plans that begin from good ones
 _LARGEST_COUNT = 10**6
 
 
@@ -51,10 +52,11 @@ class Plans:
     """Plans for E starts of a task.
 
     Attributes:
-        actions: Of all T transitions of an episode, in the frame of the task, float64 [E, T, A].
-        returns: Sums of their rewards, float64 [E].
-        success: Whether they succeed [E].
-        seeds: Of the starts: `env.reset(seed=plans.seeds.tolist())` begins there; int64 [E].
+        actions: Actions of all T transitions of an episode, in the frame of the task, float64
+            [E, T, A].
+        returns: Sums of the rewards of the plans, float64 [E].
+        success: True if the plan succeeds [E].
+        seeds: Seeds of the starts, int64 [E]: `env.reset(seed=plans.seeds.tolist())` begins there.
     """
 
     actions: Tensor
@@ -90,15 +92,15 @@ class Plans:
             raise InvalidInput(f"Plans: `seeds` must be between 0 and {LARGEST_SEED}")
 
     def __len__(self) -> int:
-        """E, the number of starts."""
+        """Return E, the number of starts."""
         return len(self.actions)
 
     def save(self, path: str | Path) -> None:
-        """Write them to a file, which replaces an older one completely or not at all.
+        """Write the plans to a file, which replaces an older one completely or not at all.
 
         Raises:
-            InvalidInput: If its folder does not exist.
-            OSError: If it cannot be written; an older file stays as it is.
+            InvalidInput: If the folder of the file does not exist.
+            OSError: If the file cannot be written; an older one remains unchanged.
         """
         path = as_path("Plans.save: `path`", path)
         if not path.parent.is_dir():
@@ -111,7 +113,7 @@ class Plans:
         """Read a file of `save`.
 
         Raises:
-            InvalidInput: If it is no such file, or is damaged.
+            InvalidInput: If `path` is no such file, or is damaged.
         """
         path = as_path("Plans.load: `path`", path)
         if not path.is_file():
@@ -135,27 +137,29 @@ def plan(
 ) -> Plans:
     """Find one plan for each of several starts, by gradients of their returns.
 
-    First, plans of some starts are found from noise around the task's first action, one an attempt.
-    Each of them is then replayed from all starts, and each start goes on from the one that serves
-    it best, with a third of the iterations. Of all iterates of a start the best is kept, by success
-    and then by return. Adam moves the knots of a plan, with betas of (.9, .95) and a rate that
-    falls linearly from .1 to .01; the gradient of each start is divided by its own norm.
+    First, each attempt optimizes a plan of one start, beginning with noise around the task's first
+    action. Each of these plans is then replayed from all starts, and the search of each start
+    continues from the best plan for it, with a third of the iterations. The best iterate of a start
+    is kept, by success and then by return. Adam updates the knots of a plan, with betas of
+    (.9, .95) and a learning rate that falls linearly from .1 to .01, or from a third of these rates
+    in the second search; the gradient of each start is divided by its own norm.
 
-    A motion that cannot be made, and a simulation that fails, cost the worst reward and have no
-    gradient: a plan moves by the gradients of its other rewards.
+    Infeasible motions and failed simulations receive the worst reward and have no gradient: a plan
+    is updated by the gradients of its other rewards.
 
     Args:
         make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7,
             opens_at=-1.0, reach=.06)`.
         episodes: E, the number of starts.
-        attempts: Number of plans that are found from noise; at most E are from different starts.
+        attempts: Number of plans that are found from noise, of at most E different starts.
         knots: Number of hat functions of the time.
         iterations: Updates of a plan that begins from noise.
-        seed: Of the starts and of the noise.
-        workers: What finds plans; None finds them here, in one thread. Bits do not depend on it.
+        seed: Seed of the starts and of the noise.
+        workers: Workers that compute plans; None: this process, in one thread. Results have the
+            same bits for any workers.
         coarse: Vertices a side of a coarser sheet, for which `make` is called with `size=coarse`:
-            plans are found there first, with all attempts, and then improved for `make` alone. None
-            for no such stage.
+            plans are found there first, with all attempts, and then improved for the sheet of
+            `make`. None: no such stage.
 
     Raises:
         InvalidInput: If an argument is not accepted.
@@ -194,10 +198,10 @@ class Improved:
     """The best iterates of some starts.
 
     Attributes:
-        knots: Before their tanh [n, K, A].
-        actions: [n, T, A].
-        returns: Sums of their rewards [n].
-        success: [n].
+        knots: Knots before tanh [n, K, A].
+        actions: Actions [n, T, A].
+        returns: Sums of rewards [n].
+        success: True if the plan succeeds [n].
     """
 
     knots: Tensor
@@ -206,7 +210,7 @@ class Improved:
     success: Tensor
 
     def better(self, other: Improved) -> Improved:
-        """Of each start the better of two, this one where they are alike."""
+        """Return the better iterate of each start; `self` in a tie."""
         wins = other.success & ~self.success
         wins |= (other.success == self.success) & (other.returns > self.returns)
         return Improved(
@@ -217,22 +221,22 @@ class Improved:
         )
 
     def rows(self, rows: Sequence[int]) -> Improved:
-        """Some of them, by their indices."""
+        """Return some of the iterates, by index."""
         return Improved(*(part[list(rows)] for part in self._parts()))
 
     def best(self) -> int:
-        """Index of the best of them, by success and then by return."""
+        """Return the index of the best iterate, by success and then by return."""
         keys = zip(self.success.tolist(), self.returns.tolist(), strict=True)
         return max(enumerate(keys), key=lambda pair: (pair[1], -pair[0]))[0]
 
     def plans(self, seeds: Sequence[int]) -> Plans:
-        """As plans of starts of these seeds."""
+        """Return plans of the starts with these seeds."""
         numbers = cpu.tensor(seeds, dtype=torch.int64)
         return Plans(self.actions, self.returns, self.success, numbers)
 
     @staticmethod
     def together(parts: Sequence[Improved]) -> Improved:
-        """One behind the other."""
+        """Concatenate parts."""
         columns = zip(*(part._parts() for part in parts), strict=True)
         return Improved(*(torch.cat(tensors) for tensors in columns))
 
@@ -243,17 +247,18 @@ class Improved:
 def improve(
     env: ClothVectorEnv, start: EnvState, knots: Tensor, iterations: int, rate: float = _RATE
 ) -> Improved:
-    """Improve plans of some environments from where they are; each by its own gradient.
+    """Improve plans of environments from a given state, each by its own gradient.
 
     Args:
-        env: Its task and its parameters count, its state stays.
-        start: After equally many transitions in all environments, without a graph.
-        knots: Of plans of whole episodes, before their tanh [n, K, A].
-        iterations: Updates; with 0 plans are only tried.
-        rate: Learning rate of Adam at first; it falls linearly to a tenth.
+        env: Environments whose task and parameters are used; their state remains unchanged.
+        start: States after equally many transitions in all environments, without a graph.
+        knots: Knots of plans of whole episodes, before tanh [n, K, A].
+        iterations: Number of updates; with 0 plans are only evaluated.
+        rate: Initial learning rate of Adam; it falls linearly to a tenth.
 
     Returns:
-        The best iterate of each start, the first one among them; actions are those that are left.
+        The best iterate of each start, including the initial one, with the remaining actions of the
+        episode.
 
     Raises:
         SimulationError: If a return or a gradient is not finite.
@@ -275,27 +280,27 @@ def improve(
             (slope,) = torch.autograd.grad(returns.sum(), leaf)
             (free.grad,) = torch.autograd.grad(before.tanh(), free, -_normalized(env, slope, k))
             adam.param_groups[0]["lr"] = rate * (1 - (1 - _LAST_SHARE) * k / max(iterations - 1, 1))
-            with cpu.DEVICE:  # where Adam keeps its counts
+            with cpu.DEVICE:  # device of the step counts of Adam
                 adam.step()
     assert best is not None
     return best
 
 
 def hats(horizon: int, knots: int) -> Tensor:
-    """Values of hat functions at the times of transitions [T, K], which sum to 1."""
+    """Return values of hat functions at the times of transitions [T, K]; rows sum to 1."""
     times = cpu.linspace(0.0, knots - 1.0, horizon)[:, None]
     return (1 - (times - cpu.arange(knots)).abs()).clamp(min=0)
 
 
 def knots_of(actions: Tensor, knots: int) -> Tensor:
-    """Knots [E, K, A] whose plans are nearest to actions [E, T, A], before their tanh."""
+    """Fit knots before tanh [E, K, A] to actions [E, T, A], by least squares before tanh."""
     shares = hats(actions.shape[1], knots)
     before = actions.clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
     return torch.stack([torch.linalg.lstsq(shares, each, driver="gelsd")[0] for each in before])
 
 
 def _followed(env: ClothVectorEnv, start: EnvState, actions: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns [n] and successes [n] of actions [n, T, A] from a state."""
+    """Compute returns [n] and successes [n] of actions [n, T, A] from a state."""
     task, place = env.task, start
     returns = cpu.zeros(len(start))
     success = cpu.zeros(len(start), dtype=torch.bool)
@@ -312,7 +317,7 @@ def _followed(env: ClothVectorEnv, start: EnvState, actions: Tensor) -> tuple[Te
 
 
 def _normalized(env: ClothVectorEnv, slope: Tensor, iteration: int) -> Tensor:
-    """Gradients [n, T, A], each divided by its own norm; those that are zero stay so."""
+    """Divide gradients [n, T, A], each by its own norm; zero gradients remain zero."""
     _require_finite(env, f"gradient of iteration {iteration}", slope.sum(dim=(1, 2)))
     norms = torch.linalg.vector_norm(slope, dim=(1, 2), keepdim=True)
     return torch.where(norms > 0, slope / norms, 0.0)
@@ -331,13 +336,14 @@ def _require_finite(env: ClothVectorEnv, name: str, values: Tensor) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """Plans that are to be improved.
+    """Plans to improve.
 
     Attributes:
-        seeds: Of the starts.
-        knots: [n, K, A].
-        iterations: Updates of each.
-        size: Vertices a side, in place of the size of the environments; None for the latter.
+        seeds: Seeds of the starts.
+        knots: Knots before tanh [n, K, A].
+        iterations: Number of updates.
+        rate: Initial learning rate of Adam.
+        size: Vertices a side of the sheet; None: the size of the environments of `make`.
     """
 
     seeds: list[int]
@@ -356,7 +362,7 @@ def _improved(make: Callable[[int, int | None], ClothVectorEnv], piece: _Piece) 
 
 
 def _improved_remotely(work: tuple[bytes, _Piece]) -> Improved:
-    """Improve plans in this process, whose environments last for later ones."""
+    """Improve plans in this process, whose environments are reused."""
     return _improved(partial(_made, work[0]), work[1])
 
 
@@ -375,7 +381,7 @@ def _stage(
     workers: Workers | None,
     pieces: Sequence[_Piece],
 ) -> Improved:
-    """Results of pieces, one behind the other; without workers in the local environments."""
+    """Compute and concatenate results of pieces; without workers in local environments."""
     if workers is None:
         return Improved.together([_improved(local, piece) for piece in pieces])
     name = pickled("plan: with `workers`, `make`", make)
@@ -388,7 +394,7 @@ _Stage = Callable[[Sequence[_Piece]], Improved]
 def _attempts(
     seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
 ) -> list[_Piece]:
-    """Plans from noise: attempt k for start k, or for start k - E and so on where E is less."""
+    """Return pieces for plans from noise: attempt k for start k modulo E."""
     chosen = [seeds[k % len(seeds)] for k in range(len(knots))]
     return _pieces(_Piece(chosen, knots, iterations, _RATE, size))
 
@@ -396,7 +402,7 @@ def _attempts(
 def _refined(
     stage: _Stage, seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
 ) -> Improved:
-    """Replay plans from all starts, and improve for each start the best of them."""
+    """Replay all plans from all starts, and improve the best plan of each start."""
     count = len(knots)
     tried = stage([_Piece([seed] * count, knots, 0, _RATE, size) for seed in seeds])
     best = [
@@ -408,7 +414,7 @@ def _refined(
 
 
 def _pieces(whole: _Piece) -> list[_Piece]:
-    """Parts of a piece, of equal sizes but for the last one, whatever makes them."""
+    """Split a piece into parts of a fixed size, independent of the number of workers."""
     return [
         replace(whole, seeds=whole.seeds[k : k + _TOGETHER], knots=whole.knots[k : k + _TOGETHER])
         for k in range(0, len(whole.seeds), _TOGETHER)

@@ -43,18 +43,18 @@ TRAINER = "trainer"
 """Kind of the files of `Trainer.save`."""
 
 _POLICY = "policy"  # kind of the files of `Policy.save`
-_WEIGHT_BYTES = 16  # with its gradient and the moments of Adam
+_WEIGHT_BYTES = 16  # including its gradient and the moments of Adam
 
 
 @dataclass(frozen=True)
 class PolicySizes:
-    """The sizes that a policy and its environments have in common.
+    """Sizes on which a policy and its environments agree.
 
     Attributes:
         observations: O, the length of an observation.
         actions: A, the length of an action.
-        time: Place in an observation of the share of the episode that has passed; None where
-            nothing observes it.
+        time: Index in an observation of the elapsed share of the episode; None if it is not
+            observed.
 
     Raises:
         InvalidInput: If a value is not accepted.
@@ -72,10 +72,10 @@ class PolicySizes:
 
     @staticmethod
     def of(env: ClothVectorEnv) -> PolicySizes:
-        """The sizes of environments.
+        """Return the sizes of environments.
 
         Raises:
-            TypeError: If they are no environments.
+            TypeError: If `env` is no `ClothVectorEnv`.
         """
         given: object = env
         if not isinstance(given, ClothVectorEnv):
@@ -89,19 +89,19 @@ class PolicySizes:
 
 
 class Policy(torch.nn.Module):
-    """A policy, its critics, slower copies that they aim at, and the scale of what they see.
+    """A policy, its critics, their target copies, and the scale of observations.
 
     Attributes:
-        sizes: Of observations and actions.
-        options: That determine the networks.
-        log_temperature: Logarithm of what a unit of entropy is worth; of "sapo" alone.
+        sizes: Sizes of observations and actions.
+        options: Options that determine the networks.
+        log_temperature: Logarithm of the temperature; used by "sapo" alone.
     """
 
     def __init__(self, sizes: PolicySizes | ClothVectorEnv, options: TrainerOptions) -> None:
         """Make networks.
 
         Args:
-            sizes: Of observations and actions, or environments that have them.
+            sizes: Sizes of observations and actions, or environments with these sizes.
             options: Algorithm, first action, sizes of the networks.
 
         Raises:
@@ -149,19 +149,19 @@ class Policy(torch.nn.Module):
 
     @property
     def temperature(self) -> float:
-        """What a unit of entropy is worth, in units of reward."""
+        """Reward that equals one unit of entropy; 0 unless the algorithm is "sapo"."""
         if not self.options.has_entropy:
             return 0.0
         return float(self.log_temperature.detach().exp())
 
     def forward(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
+        """Return actions [B, A] for observations [B, O]; `noise` is standard normal [B, A]."""
         if noise is None:
             noise = cpu.zeros(1, dtype=torch.float32)
         return self.act(observation, noise)[0]
 
     def act(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, A], and minus the logarithm of their density [B]; see `Actor`."""
+        """Return actions [B, A], and minus the logarithm of their density [B]; see `Actor`."""
         time = observation[:, self.sizes.time] if self.options.plan_knots else None
         actions, entropy = self.actor(self.scale(observation), noise, time)
         return actions, entropy
@@ -173,8 +173,8 @@ class Policy(torch.nn.Module):
         The file replaces an older one completely or not at all.
 
         Raises:
-            InvalidInput: If its folder does not exist.
-            OSError: If it cannot be written; an older file stays as it is.
+            InvalidInput: If the folder of the file does not exist.
+            OSError: If the file cannot be written; an older file remains unchanged.
         """
         content = {
             "sizes": asdict(self.sizes),
@@ -185,20 +185,20 @@ class Policy(torch.nn.Module):
 
     @called("Policy.export")
     def export(self, path: str | Path) -> None:
-        """Write the actions without noise as an ONNX model, by the extra "onnx".
+        """Write the policy without noise as an ONNX model; requires the extra "onnx".
 
-        Its input "observation" is float32 [B, O] for any B, its output "actions" float32 [B, A].
+        The input "observation" is float32 [B, O] for any B, the output "actions" float32 [B, A].
 
         Raises:
             InvalidInput: If the folder does not exist, or a package of the extra is missing.
-            OSError: If the file cannot be written; an older one stays as it is.
+            OSError: If the file cannot be written; an older one remains unchanged.
         """
         file = file_to_write("Policy.export", path)
         for module in ("onnx", "onnxscript"):
             from_extra(module, "onnx", f"Policy.export needs {module}")
         example = cpu.zeros(2, self.observations, dtype=torch.float32)
         with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # of the exporter, on its own parts
+            warnings.simplefilter("ignore")  # warnings about internals of the exporter
             program: Any = torch.onnx.export(
                 self,
                 (example,),
@@ -214,14 +214,14 @@ class Policy(torch.nn.Module):
 
 @called("load_policy")
 def load_policy(path: str | Path) -> Policy:
-    """Read a policy, which needs no environments: `policy(observation)` returns actions.
+    """Read a policy; it needs no environments, `policy(observation)` returns actions.
 
     Args:
         path: A file of `Policy.save`, of `Trainer.save`, or the `policy.pt` of `diffcloth train`.
 
     Raises:
-        InvalidInput: If it is no such file, or its content was changed or is damaged.
-        OSError: If it cannot be read.
+        InvalidInput: If `path` is no such file, or its content was changed or is damaged.
+        OSError: If the file cannot be read.
     """
     path = as_path("load_policy: `path`", path)
     if not path.is_file():
@@ -236,7 +236,7 @@ def _read(content: Any) -> Policy:
         raise InvalidInput("its content must be a dict with options and a policy")
     options = TrainerOptions(**content["options"])
     sizes = PolicySizes(**content["sizes"]) if "sizes" in content else _sizes_of(content["task"])
-    # The first weights are replaced: they must not use up random numbers of the caller.
+    # Initial weights are replaced; drawing them must not advance the generator of the caller.
     with torch.random.fork_rng(devices=[]):
         policy = Policy(sizes, options)
     check_like("the policy", dict(content["policy"]), policy.state_dict())
@@ -245,7 +245,7 @@ def _read(content: Any) -> Policy:
 
 
 def _sizes_of(task: Any) -> PolicySizes:
-    """Sizes by the description of a task in a file of a trainer."""
+    """Return sizes from the description of a task in a file of a trainer."""
     check_like("the task", {name: task[name] for name in ("actions",)}, {"actions": 0})
     places: Any = task["observations"]
     if not isinstance(places, Mapping) or not places:
@@ -257,10 +257,10 @@ def _sizes_of(task: Any) -> PolicySizes:
 
 
 def check_fits(owner: str, policy: Policy, sizes: PolicySizes) -> None:
-    """Require a policy to be for environments of some sizes.
+    """Require the sizes of a policy to match the sizes of environments.
 
     Raises:
-        InvalidInput: If they differ; the message names the size.
+        InvalidInput: If a size differs; the message names the size.
     """
     for name in ("observations", "actions"):
         own, others = getattr(policy.sizes, name), getattr(sizes, name)
@@ -276,18 +276,18 @@ def check_fits(owner: str, policy: Policy, sizes: PolicySizes) -> None:
 
 
 def begin_at(owner: str, policy: Policy, other: Policy) -> None:
-    """Copy the weights of another policy, so that actions without noise are the same.
+    """Copy the weights of another policy; actions without noise are then equal.
 
-    The widths of noise that depend on observations, the critics and the temperature are copied
-    where both policies have them.
+    Deviations that depend on observations, critics and the temperature are copied if both policies
+    have them.
 
     Args:
-        owner: Opens messages.
-        policy: Whose weights change.
-        other: Whose weights are copied.
+        owner: Prefix of messages.
+        policy: Policy whose weights change.
+        other: Policy whose weights are copied.
 
     Raises:
-        InvalidInput: If the networks have other shapes; the message names the option.
+        InvalidInput: If the shapes of the networks differ; the message names the option.
     """
     check_fits(owner, other, policy.sizes)
     for name in ("hidden", "plan_knots"):
@@ -309,13 +309,13 @@ def begin_at(owner: str, policy: Policy, other: Policy) -> None:
                 continue
             if tensor.shape == copied[name].shape:
                 tensor.copy_(copied[name])
-            else:  # the last layer, where one of both has rows for widths
+            else:  # the last layer, if only one of both has rows for deviations
                 tensor[:actions] = copied[name][:actions]
                 tensor[actions:] = 0.0
 
 
 def file_to_write(owner: str, path: object) -> Path:
-    """Require the path of a file in a folder that exists."""
+    """Require the path of a file in an existing folder, and return it."""
     file = as_path(f"{owner}: `path`", path)
     if not file.parent.is_dir():
         raise InvalidInput(f"{owner}: the folder of `path` must exist, got {str(file)!r}")
@@ -323,10 +323,10 @@ def file_to_write(owner: str, path: object) -> Path:
 
 
 def _check_memory(sizes: PolicySizes, options: TrainerOptions) -> None:
-    """Refuse networks that do not fit into memory, before they are made."""
+    """Refuse networks that do not fit into memory, before their allocation."""
     layers = [sizes.observations, *options.hidden]
     inner = sum((before + 3) * after for before, after in pairwise(layers))
-    critics = 2 * (options.critics if options.has_entropy else 1)  # and their slower copies
+    critics = 2 * (options.critics if options.has_entropy else 1)  # and their target copies
     weights = (1 + critics) * (inner + (layers[-1] + 1) * 2 * sizes.actions)
     names = "TrainerOptions: the weights by `hidden` and `critics`"
     check_memory(names, weights, _WEIGHT_BYTES, "a weight")

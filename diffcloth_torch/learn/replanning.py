@@ -1,4 +1,4 @@
-"""Plans as a teacher: they are planned again from where a policy comes to."""
+"""Plans as a teacher: replanning from the states that a policy reaches."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from diffcloth_torch.learn.starts import part_seeds
 __all__ = ["Replanning"]
 
 _KNOTS = 12
-_NOISE = 0.05  # standard deviation of the noise on plans that are followed
-_ITERATIONS = 5  # of a plan that begins from the nearest one
-_RATE = 0.03  # of Adam at first
-_BRANCHES = 3  # times of an episode from which a round plans again; the first one is its start
-_LAST_BRANCH = 0.75  # share of the episode after which nothing is planned again
+_NOISE = 0.05  # standard deviation of the noise on actions of followed plans
+_ITERATIONS = 5  # of a plan that begins from the nearest plan
+_RATE = 0.03  # initial learning rate of Adam
+_BRANCHES = 3  # times of an episode at which a round replans; the first one is the start
+_LAST_BRANCH = 0.75  # share of the episode after which no replanning begins
 
 
 class Replanning:
     """Lessons from plans.
 
     In the first round the plans are followed, with noise. In a later round the policy acts from new
-    starts; at some times of the episode the rest of it is planned by a few gradient iterations,
-    from the plan that is nearest at that time: the one whose observation then has the least
-    distance, in scaled observations. What is seen on the way of the new plan is labelled with its
-    actions, and the new plan joins the others. A new plan counts unless it fails where the nearest
-    one succeeds.
+    starts; at some times of the episode, the remaining actions are planned by a few gradient
+    iterations from the nearest plan: its scaled observation at that time has the smallest distance
+    from the present one. The observations along the new plan are labelled with its actions, and the
+    new plan is added to the others. A new plan is discarded if it fails and the nearest plan
+    succeeds.
     """
 
     def __init__(
         self, make: MakeEnv, env: ClothVectorEnv, plans: Plans, seed: int, draws: torch.Generator
     ) -> None:
-        """Take the plans.
+        """Check the plans and fit their knots.
 
         Args:
-            make: Makes environments, as many as there are plans.
-            env: The environments of later rounds.
-            plans: For starts of the same task.
-            seed: Of new starts.
-            draws: Draws noise and times.
+            make: Function that makes environments, here one for each plan.
+            env: Environments of later rounds.
+            plans: Plans for starts of the same task.
+            seed: Seed of new starts.
+            draws: Generator that draws noise and times.
 
         Raises:
-            InvalidInput: If the plans are of other episodes or actions.
+            InvalidInput: If the lengths of episodes or actions of the plans differ from the task.
         """
         expected = env.task.horizon, env.task.action_size
         if tuple(plans.actions.shape[1:]) != expected:
@@ -66,7 +66,7 @@ class Replanning:
         self._seen = cpu.zeros(0, dtype=torch.float32)  # [L, T, O]; infinite before a plan begins
 
     def round(self, policy: Policy, number: int) -> tuple[Tensor, Tensor]:
-        """Observations [n, O] and actions [n, A]."""
+        """Return the observations [n, O] and actions [n, A] of a round."""
         if number == 0:
             return self._followed()
         env, found = self._env, []
@@ -82,7 +82,7 @@ class Replanning:
         return torch.cat([seen for seen, _ in found]), torch.cat([made for _, made in found])
 
     def _followed(self) -> tuple[Tensor, Tensor]:
-        """The plans with noise."""
+        """Follow the plans with noise; return observations and actions without noise."""
         actions = self._plans.actions
         env = self._make(num_envs=len(actions))
         env.reset(seed=self._plans.seeds.tolist())
@@ -92,13 +92,13 @@ class Replanning:
         return self._seen[kept], actions.to(torch.float32)[kept]
 
     def _branches(self) -> list[int]:
-        """Times from which a round plans again, ascending."""
+        """Draw the times at which a round replans, ascending."""
         last = math.ceil(_LAST_BRANCH * self._env.task.horizon)
         later = cpu.randint(last, (_BRANCHES - 1,), generator=self._draws)
         return sorted({0, *later.tolist()})
 
     def _planned(self, place: EnvState, policy: Policy, lost: Tensor) -> tuple[Tensor, Tensor]:
-        """Plan the rest of the episodes again, but for those that are lost [B]."""
+        """Replan the rest of the episodes; lessons exclude the environments that are lost [B]."""
         env, done = self._env, int(place.elapsed[0])
         here = policy.scale(env.task.observation(place).to(torch.float32))
         near = torch.cdist(here, policy.scale(self._seen[:, done])).argmin(dim=1)
@@ -116,7 +116,7 @@ class Replanning:
 
 
 def _watched(env: ClothVectorEnv, place: EnvState, actions: Tensor) -> tuple[Tensor, Tensor]:
-    """Observations [n, T, O] before actions [n, T, A], and whether episodes still run [n, T]."""
+    """Return observations [n, T, O] before actions [n, T, A], and running flags [n, T]."""
     seen, runs = [], []
     running = cpu.ones(len(place), dtype=torch.bool)
     for k in range(actions.shape[1]):

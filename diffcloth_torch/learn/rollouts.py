@@ -1,7 +1,7 @@
-"""Rollouts of a policy: where they start, what they saw, and their gradient.
+"""Rollouts of a policy: initial states, observations, and the gradient of the loss.
 
-A piece of work is all that a rollout needs, and its result all that it found: both can be sent to
-another process. No graph leaves the process that made it.
+A `Piece` holds all inputs of a rollout, a `Rollout` all its results; both can be sent to another
+process. No autograd graph leaves the process that made it.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ __all__ = [
 ]
 
 MakeEnv = Callable[..., ClothVectorEnv]
-"""A function that makes environments, as `dc.envs.make` does; called with `num_envs` by name."""
+"""A function that makes environments, like `dc.envs.make`; called with the keyword `num_envs`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A rollout that is to be made, of some of the environments.
+    """Inputs of a rollout of some of the environments.
 
     Attributes:
-        options: Of the trainer.
+        options: Options of the trainer.
         weights: State of the `Policy`.
-        start: Where the environments are, without a graph.
-        generators: Of their next starts.
-        noise: Standard normal, [h, n, A].
-        share: What each environment counts in the loss: one over their number in all pieces.
-        threads: Of torch.
+        start: Initial state of the environments, without a graph.
+        generators: States of the random generators that draw their next starts.
+        noise: Standard normal noise [h, n, A].
+        share: Weight of each environment in the loss: one over their number in all pieces.
+        threads: Number of threads of torch.
     """
 
     options: TrainerOptions
@@ -60,21 +60,22 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """What came of a piece: h steps of n environments.
+    """Result of a piece: h steps of n environments.
 
     Attributes:
-        gradients: Of the loss, in the order of `Policy.actor.parameters()`.
-        loss: Minus what the rollout is worth.
+        gradients: Gradients of the loss, in the order of `Policy.actor.parameters()`.
+        loss: Minus the objective: mean discounted rewards, with the entropy and value terms of the
+            algorithm.
         seen: Observations before each step [h, n, O].
-        after: Observations after it, before a new start [h, n, O].
-        rewards: [h, n].
-        entropies: Of the actions: minus the logarithm of their density [h, n].
-        terminated: Whether it ended its episode before the horizon [h, n].
-        failed: Whether the simulation failed in it [h, n].
-        ended: Whether an episode ended with it [h, n].
-        success: Whether the task was done after it [h, n].
-        end: Where the environments are.
-        generators: Of their next starts.
+        after: Observations after each step, before a new start [h, n, O].
+        rewards: Rewards [h, n].
+        entropies: Minus the logarithms of the densities of the actions [h, n].
+        terminated: True if the step ended its episode before the horizon [h, n].
+        failed: True if the simulation failed in the step [h, n].
+        ended: True if the step ended an episode [h, n].
+        success: True if the task was done after the step [h, n].
+        end: Final state of the environments.
+        generators: States of the random generators that draw their next starts.
     """
 
     gradients: list[Tensor]
@@ -92,7 +93,7 @@ class Rollout:
 
 
 def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
-    """Make a rollout, and the gradient of its loss."""
+    """Compute a rollout, and the gradient of its loss."""
     o = piece.options
     policy = Policy(env, o)
     policy.load_state_dict(piece.weights)
@@ -110,7 +111,7 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
         total = total + discount * (reward + temperature * entropy)
         discount = discount * o.discount
         if o.has_critic:
-            # What follows the end of an episode or of the rollout; nothing follows a failure.
+            # Value at the end of an episode or of the rollout; zero after a termination.
             closes = truncated if t < horizon - 1 else ~terminated
             value = policy.targets(policy.scale(after)).mean(dim=0)
             total = total + torch.where(closes, discount * value, 0.0)
@@ -144,7 +145,7 @@ _made: dict[tuple[bytes, int], ClothVectorEnv] = {}  # in a worker's process
 
 
 def roll_out_remotely(work: tuple[bytes, Piece]) -> Rollout:
-    """Make a rollout in this process, whose environments last for later ones.
+    """Compute a rollout in this process, whose environments are reused.
 
     Args:
         work: A pickled `MakeEnv`, and the piece.
@@ -155,7 +156,7 @@ def roll_out_remotely(work: tuple[bytes, Piece]) -> Rollout:
 
 
 def environments(make_env: bytes, count: int) -> ClothVectorEnv:
-    """Environments of this process, which last for later pieces.
+    """Return environments of this process, which are reused for later pieces.
 
     Args:
         make_env: A pickled `MakeEnv`.
@@ -170,7 +171,7 @@ def environments(make_env: bytes, count: int) -> ClothVectorEnv:
 
 @contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Let torch have some threads; products of its matrices round by their number."""
+    """Set the number of threads of torch in a block; rounding of matrix products depends on it."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -9,28 +9,28 @@ __all__ = ["LARGEST_SEED", "PURPOSES", "episode_seeds", "part_seeds", "purpose_s
 LARGEST_SEED = 2**32 - 1
 
 PURPOSES = ("undo", "selection", "report")
-"""Uses of starts in a training, which have no start in common."""
+"""Uses of starts in a training; no two uses share a start."""
 
 
 def part_seeds(seed: int, part: int, count: int) -> list[int]:
-    """Seeds of starts for a part of a computation; other parts and seeds have others.
+    """Return seeds of starts for a part of a computation; they differ between parts and seeds.
 
     Args:
-        seed: Of the computation.
-        part: Such as a round.
-        count: Their number.
+        seed: Seed of the computation.
+        part: Number of the part, such as a round.
+        count: Number of seeds.
     """
     return [int(np.random.SeedSequence([seed, part, i]).generate_state(1)[0]) for i in range(count)]
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:
-    """A seed for each episode, of which the first ones do not depend on the number."""
+    """Return one seed for each episode; seed i does not depend on the number of episodes."""
     sequences = [np.random.SeedSequence(seed, spawn_key=(i,)) for i in range(episodes)]
     return [int(s.generate_state(1, np.uint64)[0]) for s in sequences]
 
 
 def purpose_seed(seed: int, purpose: str) -> int:
-    """The seed of the starts of one of `PURPOSES`, by the seed of a training."""
-    # Seeds of `Trainer` for its own starts have no spawn key.
+    """Return the seed of the starts for one of `PURPOSES`, derived from the seed of a training."""
+    # The spawn key separates these seeds from the seeds of rollouts, which have none.
     sequence = np.random.SeedSequence(seed, spawn_key=(PURPOSES.index(purpose),))
     return int(sequence.generate_state(1, np.uint64)[0])

@@ -1,10 +1,10 @@
-"""Policies by gradients through the simulation: APG, SHAC and SAPO.
+"""Policy optimization by gradients through the simulation: APG, SHAC and SAPO.
 
 References:
     SHAC: Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin, "Accelerated Policy Learning with
-    Parallel Differentiable Simulation", ICLR 2022. APG is the same without its critic.
+    Parallel Differentiable Simulation", ICLR 2022. APG is SHAC without a critic.
     SAPO: Xing, Luk, Oh, "Stabilizing Reinforcement Learning in Differentiable Multiphysics
-    Simulation", ICLR 2025: the same with entropy and several critics.
+    Simulation", ICLR 2025: SHAC with entropy and several critics.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ __all__ = ["Trainer", "record_of", "restore"]
 
 
 class Trainer:
-    """Learns a policy for environments whose rewards have gradients.
+    """Trainer of a policy in environments whose rewards have gradients.
 
-    The environments are in chunks of a fixed size, and results are summed in their order: any
-    number of workers gives the same bits.
+    Environments are divided into chunks of a fixed size, and results are summed in the order of the
+    chunks: updates have the same bits for any number of workers.
 
     Attributes:
-        policy: The policy and its critic.
-        options: As given, or those of fine-tuning where `init` is given.
-        steps: Environment steps of rollouts so far.
-        updates: Of the policy so far.
+        policy: The policy and its critics.
+        options: Options; with `init`, completed by the bounds of fine-tuning.
+        steps: Number of environment steps of rollouts so far.
+        updates: Number of updates so far.
         held_out: Seeds of the starts at which the policy is checked; see `TrainerOptions`.
-        undone: How often a check has restored an earlier policy.
+        undone: Number of checks that restored an earlier policy.
     """
 
     def __init__(
@@ -82,20 +82,21 @@ class Trainer:
         threads: int = 1,
         init: Policy | None = None,
     ) -> None:
-        """Make the networks, and begin episodes.
+        """Create the networks, and begin episodes.
 
         Args:
-            make_env: Makes environments that begin anew in the step in which they end:
+            make_env: Function that makes environments with `autoreset_mode="SameStep"`:
                 `functools.partial(dc.envs.make, "FoldCloth", size=12)`.
-            options: How to learn; None for those of `init`, or else the defaults.
+            options: Options of the training; None: the options of `init`, or else the defaults.
             num_envs: Number of environments in a rollout.
-            chunk: Number of them that step together; all by default. It must divide `num_envs`.
-            workers: What makes the rollouts of chunks; None makes them here.
-            threads: Of torch in an update, here and in each worker. Results depend on it in the
-                last bits.
-            init: A policy at whose weights training begins, of the same observations and actions,
-                hidden layers and number of knots. Its algorithm, task, horizon and rates may be
-                others. Then updates are bounded and checked by default: see `max_change` and
+            chunk: Number of environments that step together; by default all. It must divide
+                `num_envs`.
+            workers: Workers that compute the rollouts of chunks; None: this process.
+            threads: Number of threads of torch in an update, here and in each worker. The last bits
+                of results depend on this number.
+            init: Policy at whose weights training begins, with the same observations, actions,
+                hidden layers and number of knots. Its algorithm, task, horizon and rates may
+                differ. Updates are then bounded and checked by default: see `max_change` and
                 `held_out` of `TrainerOptions`.
 
         Raises:
@@ -162,11 +163,11 @@ class Trainer:
 
     @property
     def task(self) -> Task:
-        """What is to be done."""
+        """Task of the environments."""
         return self._env.task
 
     def act(self, observation: Tensor) -> Tensor:
-        """Actions [B, A] without noise."""
+        """Return actions [B, A] without noise."""
         given: object = observation
         if not isinstance(given, Tensor) or given.dtype != torch.float32 or not given.is_cpu:
             kind = given.dtype if isinstance(given, Tensor) else type(given).__name__
@@ -179,15 +180,15 @@ class Trainer:
         return actions
 
     def update(self) -> dict[str, float]:
-        """Take one rollout of all environments, and improve the policy and the critic by it.
+        """Compute a rollout of all environments, and update the policy and the critics.
 
         Returns:
-            What to log: "loss", "gradient_norm" before it is limited, "reward" (the mean of the
-            rollout), "failed" (share of steps), "entropy" (of the policy, per number of an action),
-            "critic_loss", "temperature" and, where episodes ended, their mean "return" and share of
-            "success". With `max_change` also "change", of actions by the update, and "step_share",
-            the share of the update that was made; after a check "held_out", the share of successes,
-            and "undone", 1 where an earlier policy was restored.
+            Values to log: "loss", "gradient_norm" before clipping, "reward" (mean of the rollout),
+            "failed" (share of steps), "entropy" (of the policy, per number of an action),
+            "critic_loss", "temperature" and, if episodes ended, their mean "return" and share of
+            "success". With `max_change` also "change", the change of actions by the update, and
+            "step_share", the applied share of the update; after a check "held_out", the share of
+            successes, and "undone", 1 if an earlier policy was restored.
 
         Raises:
             SimulationError: If a gradient is not finite.
@@ -231,14 +232,15 @@ class Trainer:
         return log
 
     def check(self) -> dict[str, float]:
-        """Follow the policy from the held-out starts, and restore the last good one if it is worse.
+        """Evaluate the policy at the held-out starts; restore the last good policy if it is worse.
 
-        `update` does so after every `check_every` updates. At the end of a fine-tuning, this makes
-        sure that its policy succeeds there as often as the one that it began at.
+        `update` calls this method after every `check_every` updates. Called after the last update
+        of a fine-tuning, it ensures that the final policy succeeds at these starts at least as
+        often as the initial policy.
 
         Returns:
-            "held_out": the share of successes of the policy that was checked; "undone": 1 if an
-            earlier policy, whose share was larger, was restored. Empty without held-out starts.
+            "held_out": the share of successes of the checked policy; "undone": 1 if an earlier
+            policy with a larger share was restored. Empty without held-out starts.
         """
         if not self.held_out:
             return {}
@@ -257,15 +259,15 @@ class Trainer:
         return {"held_out": success, "undone": float(undone)}
 
     def evaluate(self, episodes: int = 8, seed: int = 0) -> tuple[float, float, list[State]]:
-        """Follow the policy without noise.
+        """Evaluate the policy without noise.
 
         Args:
-            episodes: How many.
-            seed: Of their starts.
+            episodes: Number of episodes.
+            seed: Seed of the starts.
 
         Returns:
             Mean return, share of successes at the end, and the states of all episodes until the
-            first of them ends.
+            first episode ends.
         """
         check_count("Trainer.evaluate: `episodes`", episodes, 1)
         check_count("Trainer.evaluate: `seed`", seed, 0)
@@ -293,14 +295,14 @@ class Trainer:
         }
 
     def _load(self, owner: str, given: Any) -> None:
-        """Check a record completely, then go on with it."""
+        """Check a record completely, then restore its state."""
         own = self._record()
-        if isinstance(given, Mapping):  # files before there was fine-tuning have neither
+        if isinstance(given, Mapping):  # files written before fine-tuning existed lack both
             given = {"undone": 0, "kept": None} | dict(given)
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
         _require_task(owner, given["task"], own["task"])
-        # An earlier version did not have the other options.
+        # Files of earlier versions lack newer options, which then have their defaults.
         if not isinstance(given["options"], dict) or (
             asdict(TrainerOptions()) | given["options"] != own["options"]
         ):
@@ -329,7 +331,7 @@ class Trainer:
             if not self.held_out:
                 raise InvalidInput(f"{name} must be None without held-out starts")
             last_good = Kept.checked(name, given["kept"], self.policy, self._actor_steps, updates)
-        # Everything is checked: from here on nothing may fail.
+        # All checks are done: the assignments below must not fail.
         self.policy.load_state_dict(given["policy"])
         for optimizer, kept in zip(self._optimizers, given["optimizers"], strict=True):
             optimizer.load_state_dict(kept)
@@ -358,7 +360,7 @@ class Trainer:
             if bool(((place.elapsed < 0) | (place.elapsed >= self.task.horizon)).any()):
                 raise InvalidInput(f"{name}: elapsed must be below {self.task.horizon}")
             self.task.simulator.kinetic_energy(place.state)  # checks the state
-            # As an update does: the report must be of as many environments.
+            # Same call as in an update: fails if the number of environments in the report differs.
             everywhere = cpu.ones(self._chunk, dtype=torch.bool)
             EnvState.where(everywhere, place, example)
             for i, generator in enumerate(generators):
@@ -367,24 +369,24 @@ class Trainer:
         return places
 
     def save(self, path: str | Path) -> None:
-        """Write all that goes on to a file, which replaces an older one completely or not at all.
+        """Write the state to a file, which replaces an older one completely or not at all.
 
-        The file loads with `weights_only`, too.
+        `torch.load` also reads the file with `weights_only=True`.
 
         Raises:
-            InvalidInput: If its folder does not exist.
-            OSError: If it cannot be written; an older file stays as it is.
+            InvalidInput: If the folder of the file does not exist.
+            OSError: If the file cannot be written; an older one remains unchanged.
         """
         write_checkpoint(file_to_write("Trainer.save", path), TRAINER, self._record())
 
     def load(self, path: str | Path) -> None:
-        """Go on with the content of a file of `save`, to the same bits.
+        """Continue from a file of `save`, with the same bits as without the interruption.
 
-        With a file of 0.1, which keeps no environments, all episodes begin anew.
+        Files of 0.1 have no states of environments: all episodes begin anew.
 
         Raises:
-            InvalidInput: If it is no such file, is damaged, or is of another task, of other
-                options, or of environments in other chunks. The trainer is then as before.
+            InvalidInput: If `path` is no such file or is damaged, or if its task, options or chunks
+                differ. The trainer then remains unchanged.
         """
         path = as_path("Trainer.load: `path`", path)
         if not path.is_file():
@@ -395,7 +397,7 @@ class Trainer:
 
     @property
     def _described(self) -> dict[str, Any]:
-        """What a file of another task differs in."""
+        """Description of the task, which must match on loading."""
         task = self.task
         sizes = {n: [s.start, s.stop] for n, s in task.observation_slices.items()}
         return {
@@ -420,7 +422,7 @@ class Trainer:
         return [self._begin(range(k, k + self._chunk)) for k in self._chunks]
 
     def _begin(self, numbers: Sequence[int]) -> tuple[EnvState, list[Tensor]]:
-        """Environments by their numbers, each of which has a seed of its own."""
+        """Begin episodes of the environments of given numbers, each with its own seed."""
         words = [np.random.SeedSequence([self.options.seed, i]).generate_state(1) for i in numbers]
         self._env.reset(seed=[int(word[0]) for word in words])
         return self._env.env_state, self._env.generator_states()
@@ -434,7 +436,7 @@ class Trainer:
         return list(self._workers.map(roll_out_remotely, [(self._pickled, p) for p in pieces]))
 
     def _digest(self) -> bytes:
-        """Of what decides on an update beside the environments."""
+        """Compute a digest of all inputs of an update except the environments."""
         digest = hashlib.blake2b(repr((self.options, self._count, self._chunk)).encode())
         for tensor in self.policy.state_dict().values():
             digest.update(tensor.contiguous().numpy().tobytes())
@@ -444,7 +446,7 @@ class Trainer:
         o = self.options
         sizes = (o.horizon, self._count, self.task.action_size)
         noise = cpu.randn(*sizes, generator=self._noise, dtype=torch.float32)
-        # The workers' copies must not change with ours.
+        # Copies: the weights of pieces must not change with an update.
         weights = {name: t.clone() for name, t in self.policy.state_dict().items()}
         return [
             Piece(
@@ -461,7 +463,7 @@ class Trainer:
 
     def _step_actor(self, rollouts: Sequence[Rollout], learns: bool) -> float:
         for k, parameter in enumerate(self.policy.actor.parameters()):
-            # One after the other, in the order of the chunks.
+            # Summed in the order of the chunks, for the same bits.
             gradient = torch.zeros_like(parameter)
             for rollout in rollouts:
                 gradient += rollout.gradients[k]
@@ -474,14 +476,14 @@ class Trainer:
                 "root or a norm in a reward has no derivative at 0"
             )
         if learns:
-            with cpu.DEVICE:  # where Adam keeps its counts
+            with cpu.DEVICE:  # device of the step counts of Adam
                 self._actor_steps.step()
         return float(norm)
 
     def _fit_critics(self, rows: _Rows) -> float:
         o, policy = self.options, self.policy
         with torch.no_grad():
-            # The least opinion: what one critic alone overestimates a policy would climb.
+            # Minimum over critics: the policy would exploit states that one critic overestimates.
             values = policy.targets(policy.scale(rows.after)).amin(dim=0)
             rewards = rows.rewards + policy.temperature * rows.entropies
             goals = _lambda_returns(rows, rewards, values, o.discount, o.gae_lambda).flatten()
@@ -503,7 +505,7 @@ class Trainer:
         return sum(losses) / len(losses)
 
     def _step_temperature(self, entropy: float) -> None:
-        """Make entropy worth more where there is too little of it, and less where too much."""
+        """Raise the temperature if the entropy is below its target, otherwise lower it."""
         too_much = entropy - self.options.target_entropy
         self.policy.log_temperature.grad = cpu.tensor(
             too_much * self.policy.temperature, dtype=torch.float32
@@ -512,7 +514,7 @@ class Trainer:
             self._temperature_steps.step()
 
     def _ended(self, rows: _Rows) -> dict[str, float]:
-        """Mean return and share of success of the episodes that have ended, if any has."""
+        """Compute mean return and share of successes of ended episodes; empty if there are none."""
         returns, successes = [], []
         for rewards, ended, success in zip(rows.rewards, rows.ended, rows.success, strict=True):
             self._return += rewards
@@ -528,22 +530,22 @@ class Trainer:
 
 
 def record_of(trainer: Trainer) -> dict[str, Any]:
-    """Everything that a training goes on with, in types that `torch.load` reads."""
+    """Return the state of a training, in types that `torch.load` reads."""
     return trainer._record()
 
 
 def restore(trainer: Trainer, record: Any) -> None:
-    """Go on with the record of another trainer, to the same bits.
+    """Continue from the record of another trainer, with the same bits.
 
     Raises:
-        InvalidInput: If it belongs to another training, or has anything that `record_of` does not
-            return. The trainer is then as before.
+        InvalidInput: If the record is of another training, or differs in structure from a record of
+            `record_of`. The trainer then remains unchanged.
     """
     trainer._load("the trainer", record)
 
 
 def _require_task(owner: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Require the description of a task of which a policy can go on."""
+    """Require the description of a task whose policy can be trained further."""
     if given == own:
         return
     if not {"name", "frame", "observations"} <= given.keys() or given["name"] != own["name"]:
@@ -562,7 +564,7 @@ def _require_task(owner: str, given: Mapping[str, Any], own: Mapping[str, Any]) 
 
 
 class _Rows:
-    """The rollouts of all chunks, side by side: [h, B, ...]."""
+    """Rollouts of all chunks, concatenated over environments: [h, B, ...]."""
 
     def __init__(self, rollouts: Sequence[Rollout]) -> None:
         def all_of(name: str) -> Tensor:
@@ -577,18 +579,18 @@ class _Rows:
 def _lambda_returns(
     rows: _Rows, rewards: Tensor, values: Tensor, discount: float, trace: float
 ) -> Tensor:
-    """Returns [h, B] that mix all lengths of look-ahead.
+    """Compute lambda returns [h, B], which average returns over all lengths of look-ahead.
 
     Args:
-        rows: When episodes ended or failed.
-        rewards: Of each step [h, B].
-        values: Of what follows each step [h, B].
+        rows: Rollouts, for the ends and terminations of episodes.
+        rewards: Rewards of each step [h, B].
+        values: Values of the states after each step [h, B].
         discount: Gamma.
         trace: Lambda.
     """
     from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-    # The last step ends what is known.
+    # Rollouts end at the last step: its return is bootstrapped.
     ended = rows.ended.clone()
     ended[-1] = True
     result: Tensor = td_lambda_return_estimate(

@@ -1,7 +1,7 @@
-"""Workers that make pieces of work: processes, jobs, actors of Ray, ranks of a torchrun job.
+"""Workers that compute pieces of work: processes, jobs, Ray actors, ranks of a torchrun job.
 
-Each has `map(function, items)`, which gives the results in the order of the items, as executors of
-`concurrent.futures` do. A piece does not depend on who makes it: all give the same bits.
+Each class has `map(function, items)`, which returns results in the order of the items, as executors
+of `concurrent.futures` do. The result of a piece has the same bits for all workers.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 _DEADLINES = Range(0.0, LONGEST_DEADLINE)
-_REPEATS = 3  # of pieces whose actor died, before the error is passed on
+_REPEATS = 3  # of a piece whose actor died, before an error is raised
 
 
 class Workers(Protocol):
-    """What makes pieces of work; an executor of `concurrent.futures` is one, but of threads."""
+    """Protocol of workers; executors of `concurrent.futures` satisfy it, except thread pools."""
 
     def map(self, function: Callable[[Any], Any], items: Any, /) -> Iterable[Any]:
-        """Results of a function for items, in their order."""
+        """Return results of a function for items, in their order."""
         ...
 
 
 def check_workers(name: str, workers: object) -> None:
-    """Require something that computes pieces, or None."""
+    """Require workers, or None."""
     refuse_threads(name, workers)
     if workers is not None and (
         isinstance(workers, type) or not callable(getattr(workers, "map", None))
@@ -60,7 +60,7 @@ def pickled(name: str, function: object) -> bytes:
     """Pickle a function that workers call.
 
     Raises:
-        InvalidInput: If it cannot be pickled.
+        InvalidInput: If the function cannot be pickled.
     """
     try:
         return pickle.dumps(function)
@@ -72,7 +72,7 @@ def pickled(name: str, function: object) -> bytes:
 
 
 class _Portable(Generic[A, B]):
-    """A function whose exceptions reach other processes; what cannot be pickled becomes text."""
+    """A function whose exceptions can be pickled; other exceptions are replaced by their text."""
 
     def __init__(self, function: Callable[[A], B]) -> None:
         self._function = function
@@ -88,17 +88,17 @@ class _Portable(Generic[A, B]):
 
 
 class Processes:
-    """Processes on this machine, which end with this one however it ends.
+    """Processes on this machine, which end with this process, however it ends.
 
-    A piece whose process dies, or misses the deadline, is computed again, up to three times.
+    A piece is recomputed up to three times if its process dies or misses the deadline.
     """
 
     def __init__(self, count: int, *, deadline: float = DEADLINE) -> None:
         """Prepare to start processes.
 
         Args:
-            count: Their number.
-            deadline: Longest time of a piece [s].
+            count: Number of processes.
+            deadline: Longest duration of a piece [s].
 
         Raises:
             InvalidInput: If an argument is not accepted.
@@ -109,10 +109,10 @@ class Processes:
         self._lock = threading.Lock()
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
-        """Results in the order of the items.
+        """Compute results in the order of the items.
 
         Raises:
-            WorkerError: If processes die, or miss the deadline, again and again.
+            WorkerError: If processes for a piece die, or miss the deadline, four times.
         """
         with self._lock:
             return list(self._pool.map(function, items))
@@ -123,35 +123,34 @@ class Processes:
 
 
 class Jobs:
-    """Whatever has `submit(function, item)`, whose result has `result()`.
+    """Any executor with `submit(function, item)` that returns an object with `result()`.
 
-    So do executors of submitit (Slurm) and clients of dask, whose `map` is another one.
+    Examples are executors of submitit (Slurm) and clients of dask, whose own `map` differs.
     """
 
     def __init__(self, executor: Any) -> None:
-        """Take an executor that has been set up; it is closed by who made it."""
+        """Wrap a configured executor; the caller closes it."""
         self.executor = executor
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
-        """Results in the order of the items."""
+        """Compute results in the order of the items."""
         jobs = [self.executor.submit(function, item) for item in items]
         return [job.result() for job in jobs]
 
 
 class RayActors:
-    """Actors of Ray, on this machine or on a cluster: `ray.init` says which.
+    """Actors of Ray, on this machine or on the cluster of `ray.init`.
 
-    An actor that dies is started again, and what it did not finish is made again, up to three
-    times.
+    Ray restarts an actor that dies, and repeats its unfinished pieces, up to three times.
     """
 
     def __init__(self, count: int, *, cores: float = 1.0, deadline: float = DEADLINE) -> None:
-        """Start the actors, and Ray on this machine where it has not been started.
+        """Start the actors, and Ray on this machine unless it has been initialized.
 
         Args:
             count: Number of actors.
-            cores: That each occupies.
-            deadline: Longest time until the next result of a `map` arrives [s].
+            cores: Number of cores that each actor occupies.
+            deadline: Longest wait for the next result of a `map` [s].
 
         Raises:
             InvalidInput: If an argument is not accepted, or Ray is not installed.
@@ -161,7 +160,7 @@ class RayActors:
         self._deadline = check_number("RayActors: `deadline`", deadline, _DEADLINES)
         ray = from_extra("ray", "ray", "RayActors needs ray")
         if not ray.is_initialized():
-            # As many as they occupy, or they would wait for cores for ever.
+            # The cores that all actors occupy; with fewer, actors would never be scheduled.
             cpus = max(math.ceil(count * cores), 1)
             ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False)
         remote: Any = ray.remote(num_cpus=cores, max_restarts=-1, max_task_retries=_REPEATS)(
@@ -170,12 +169,12 @@ class RayActors:
         self.actors: list[Any] = [remote.remote() for _ in range(count)]
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
-        """Results in the order of the items.
+        """Compute results in the order of the items.
 
         Raises:
-            WorkerError: If actors die again and again, or no result arrives within the deadline,
-                which ends the actors.
-            InvalidInput: If they have been closed.
+            WorkerError: If actors die four times over a piece, or if no result arrives within the
+                deadline; the actors are then ended.
+            InvalidInput: If the actors have been closed.
         """
         from ray.exceptions import RayActorError
         from ray.util import ActorPool
@@ -218,21 +217,21 @@ class _Caller:
 
 
 class Ranks:
-    """The processes of a `torchrun` job, each of which runs the same program.
+    """The processes of a `torchrun` job, which all run the same program.
 
-    Each makes the pieces that fall to it and sends the results to all, so that all go on alike.
-    Under torchrun each ends with the agent that started it, however the agent ends.
+    Each process computes its share of the pieces, and all gather all results, so their states stay
+    equal. Under torchrun, a process ends with the agent that started it, however the agent ends.
     """
 
     def __init__(self, *, deadline: float = DEADLINE) -> None:
-        """Join the job by gloo, where `torch.distributed` has not been initialized.
+        """Join the job by gloo, unless `torch.distributed` has been initialized.
 
         Args:
-            deadline: Longest time to wait for the results of the others [s]; a group that has been
-                initialized keeps its own.
+            deadline: Longest wait for the results of other processes [s]; a group that has been
+                initialized keeps its own timeout.
 
         Raises:
-            InvalidInput: If this is no process of a job.
+            InvalidInput: If this process does not belong to a job.
         """
         import torch.distributed as dist
 
@@ -246,17 +245,17 @@ class Ranks:
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
-        """Results in the order of the items, in every process.
+        """Compute results in the order of the items, in every process.
 
         Raises:
-            Exception: What a piece raised in any of the processes.
-            WorkerError: If a process has died, or missed the deadline.
+            Exception: The error of the first failed piece, in all processes.
+            WorkerError: If a process has died or missed the deadline.
         """
         made: list[tuple[B | None, Exception | None]] = []
         for item in items[self.rank :: self.size]:
             try:
                 made.append((function(item), None))
-            except Exception as error:  # all processes must learn of it, or they would wait
+            except Exception as error:  # sent to all processes, which would otherwise wait
                 made.append((None, portable(error)))
         gathered = self._gather(made)
         results = []
@@ -268,10 +267,14 @@ class Ranks:
         return results
 
     def require_same(self, what: str, digest: bytes) -> None:
-        """Require all processes to have the same digest of something.
+        """Require equal digests in all processes.
+
+        Args:
+            what: Name of the digested data, for the message.
+            digest: Digest of this process.
 
         Raises:
-            InvalidInput: If they do not, in every process.
+            InvalidInput: If digests differ; raised in every process.
         """
         digests = self._gather(digest)
         others = [rank for rank, other in enumerate(digests) if other != digests[0]]
@@ -282,13 +285,13 @@ class Ranks:
             )
 
     def _gather(self, value: object) -> list[Any]:
-        """The values of all processes, in the order of their ranks."""
+        """Gather the values of all processes, in the order of ranks."""
         import torch.distributed as dist
 
         gathered: list[Any] = [None] * self.size
         try:
             dist.all_gather_object(gathered, value)
-        except RuntimeError as error:  # of gloo: a connection that is closed, or a time out
+        except RuntimeError as error:  # of gloo: a closed connection or a timeout
             raise WorkerError(
                 f"Ranks: another process died, or gave no result within the deadline, as rank "
                 f"{self.rank} of {self.size} reports: {error}"

@@ -1,4 +1,4 @@
-"""`record`: a data set that Minari reads, which replays, and refusals."""
+"""`record`: a data set that Minari reads and that can be replayed, and refusals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def act(observation):
 
 
 def test_minari_reads_what_replays(tmp_path, monkeypatch):
-    """Nine episodes in two chunks, of which the second fails in its third step."""
+    """Nine episodes in two chunks; the simulation of the second episode fails in step 3."""
     minari = pytest.importorskip("minari", reason="minari is in the extra `data`")
     pytest.importorskip("h5py", reason="h5py is in the extra `data`")
     calls, real = [], env_module.failures
@@ -55,7 +55,7 @@ def test_minari_reads_what_replays(tmp_path, monkeypatch):
         np.testing.assert_array_equal(episode.observations[0], observation[0])
         for t in range(2):
             _, reward, _, _, info = env.step(torch.tensor(episode.actions[t])[None])
-            # float32 actions.
+            # Stored actions are float32.
             seen = info["obs_before_reset"][0]
             np.testing.assert_allclose(episode.observations[t + 1], seen, atol=1e-5)
             assert episode.rewards[t] == pytest.approx(float(reward), abs=1e-5)

@@ -1,4 +1,4 @@
-"""`evaluate`: starts by their seeds, charges, intervals, the same bits whoever computes them."""
+"""`evaluate`: seeds of starts, costs of failures, intervals, and equal bits for all workers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ make = functools.partial(dc.envs.make, "FoldCloth", size=5, horizon=4, opens_at=
 
 @pytest.fixture(scope="module")
 def policy():
-    """A policy whose actions depend on what it sees."""
+    """A policy whose actions depend on observations."""
     torch.manual_seed(0)
     policy = Policy(make(num_envs=1), TrainerOptions(plan_knots=3, hidden=(16, 8)))
     with torch.no_grad():
@@ -33,7 +33,7 @@ def policy():
 
 
 class Pickling:
-    """Workers in this process, to which everything is sent as to others."""
+    """Workers in this process that pickle functions, items and results."""
 
     def map(self, function, items):
         sent = [pickle.loads(pickle.dumps((function, item))) for item in items]
@@ -64,7 +64,7 @@ class TestEpisodes:
             assert found.seeds == many.seeds[:count]
 
     def test_have_actions_that_do_not_depend_on_others(self, policy):
-        """Products of matrices round by the number of rows."""
+        """Rounding of matrix products depends on the number of rows."""
         seen = torch.randn(8, policy.observations, generator=torch.Generator().manual_seed(0))
         act = acting("evaluate", make(num_envs=1), policy)
         with torch.no_grad():
@@ -110,7 +110,7 @@ class TestEpisodes:
         assert len(states) == 4
 
     def test_count_what_happened(self, monkeypatch):
-        """A success that was lost, a blocked motion, and a simulation that fails in step 3."""
+        """A temporary success, a blocked motion, and a simulation that fails in step 3."""
         calls = []
 
         def failures(state):
@@ -133,7 +133,7 @@ class TestEpisodes:
         assert found.blocked.tolist() == [True, False]
         assert found.failed.tolist() == [False, True]
         assert found.steps == 4 + 3
-        # The third and the fourth step are charged.
+        # The failed step 3 and the remaining step 4 each cost the worst reward.
         assert float(found.returns[1]) < 2 * FoldCloth.worst + 2
 
     def test_are_short_to_read(self):

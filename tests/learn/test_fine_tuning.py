@@ -41,7 +41,7 @@ def assert_same_bits(a, b):
 
 
 def successes(monkeypatch, *rates):
-    """Evaluations at held-out starts have these shares of successes, one after the other."""
+    """Replace evaluations at held-out starts by given shares of successes, in order."""
     left = list(rates)
 
     def evaluate(owner, make_env, policy, seeds, *, workers):
@@ -55,7 +55,7 @@ def successes(monkeypatch, *rates):
 class TestInit:
     @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
     def test_begins_at_the_weights(self, begun, algorithm):
-        """With another algorithm, rate, horizon, number of environments and length of episodes."""
+        """Algorithm, rate, horizon, number of environments and length of episodes may differ."""
         options = replace(OPTIONS, algorithm=algorithm, learning_rate=1e-4, horizon=2, held_out=0)
         longer = functools.partial(dc.envs.make, "FoldCloth", size=5, horizon=6, **SOFT)
         trainer = Trainer(longer, options, num_envs=3, init=begun)
@@ -99,7 +99,7 @@ class TestInit:
 
 class TestTrustRegion:
     def changes(self, trainer, monkeypatch):
-        """The change of the actions by an update in what it saw, and its log."""
+        """Update; return the change of actions at the observations of the rollout, and the log."""
         seen = []
         real = trainer._rollouts
 
@@ -121,7 +121,7 @@ class TestTrustRegion:
             OPTIONS, learning_rate=0.05, plan_learning_rate=0.2, max_change=0.01, held_out=0
         )
         change, log = self.changes(Trainer(make, bounded, num_envs=2, init=begun), monkeypatch)
-        # By bisection to 1e-6 of the update.
+        # Bisection is exact to 1e-6 of the update.
         assert 0.0099 < change <= 0.01
         assert log["change"] == pytest.approx(change)
         assert 0 < log["step_share"] < 0.5
@@ -180,7 +180,7 @@ class TestChecks:
         assert not {*other.held_out} & {*trainer.held_out}
 
     def test_go_on_with_the_same_bits(self, begun, monkeypatch, tmp_path):
-        """Interrupted where the policy that is kept is not the present one."""
+        """Interruption while the last good policy differs from the present policy."""
         options = replace(self.OPTIONS, check_every=2)
         rates = 0.5, 0.25, 0.25
         left = successes(monkeypatch, *rates)
@@ -188,7 +188,7 @@ class TestChecks:
         for _ in range(3):
             one.update()
         one.save(tmp_path / "trainer.pt")
-        again = Trainer(make, one.options, num_envs=2)  # without the policy
+        again = Trainer(make, one.options, num_envs=2)  # without `init`
         again.load(tmp_path / "trainer.pt")
         assert len(left) == 1
         logs = []

@@ -1,4 +1,4 @@
-"""Policies that imitate: who acts, who labels, which states are visited, and refusals."""
+"""Imitation: actions by teacher and policy, labels, visited states, and refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def constant(observation, env):
 
 
 class Recorder:
-    """A teacher that keeps what it is shown."""
+    """A teacher that records the observations it receives."""
 
     def __init__(self):
         self.seen = []
@@ -51,12 +51,12 @@ def test_the_script_is_imitated():
 def test_a_function_is_imitated():
     policy = imitate(MAKE, constant, **(FEW | {"iterations": 100}))
     observation, _ = MAKE(num_envs=3).reset(seed=9)
-    # The fit of 20 rows ends within a hundredth; other starts are a little further.
+    # Errors of the fit are below .01 at its 20 rows, and a little larger at other starts.
     assert float((policy(observation).detach() - 0.5).abs().max()) < 0.05
 
 
 def test_plans_are_followed_and_planned_again():
-    """The first lessons are those of the plans, the later ones begin from new starts."""
+    """The first round follows the plans; later rounds begin from new starts."""
     env = SOFT(num_envs=2)
     draws = torch.Generator().manual_seed(0)
     plans = plan(SOFT, episodes=3, attempts=1, knots=3, iterations=1)
@@ -70,10 +70,10 @@ def test_plans_are_followed_and_planned_again():
         seen, shown = lessons.round(policy, 1)
     first, _ = env.reset(seed=part_seeds(3, 1, 2))
     assert torch.equal(seen[:10:5], first)
-    # Plans from the start, and from up to two later times of an episode of five transitions.
+    # The second round replans at the start, and at up to two later times of five transitions.
     assert len(seen) == len(shown) > 10
     assert len(lessons._knots) == len(lessons._seen) >= 3 + 2 * 2
-    # Plans from the start begin from the nearest ones, and five steps of .03 lead no further.
+    # New plans begin from the nearest plans; five steps of .03 bound the distance.
     near = torch.cdist(policy.scale(first), policy.scale(lessons._seen[:3, 0])).argmin(dim=1)
     moved = lessons._knots[3:5] - lessons._knots[near]
     assert float(moved.abs().max()) < 0.2
@@ -99,7 +99,7 @@ def test_plans_of_other_episodes_are_refused():
 
 
 def test_the_teacher_labels_the_states_that_the_policy_visits():
-    """The second round starts anew and follows the policy of the first one."""
+    """The second round has new starts and follows the policy of the first round."""
     teacher = Recorder()
     imitate(MAKE, teacher, **FEW)
     first = imitate(MAKE, "scripted", **(FEW | {"rounds": 1}))

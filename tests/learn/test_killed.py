@@ -45,7 +45,7 @@ fit:
 
 
 def begun(command, tmp_path):
-    """A main process and its workers, which have begun to compute."""
+    """Start a main process; return it and its workers once all are computing."""
     config = tmp_path / "config.yaml"
     config.write_text({"train": TRAIN, "fit": FIT}[command])
     out = tmp_path / "out"

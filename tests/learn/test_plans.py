@@ -34,7 +34,7 @@ def assert_same(a, b):
 
 
 def followed(make, plans):
-    """Returns and successes of plans, by the interface of gymnasium."""
+    """Replay plans by the interface of gymnasium; return returns and successes."""
     env = make(num_envs=len(plans), autoreset_mode="Disabled")
     env.reset(seed=plans.seeds.tolist())
     total = torch.zeros(len(plans))
@@ -100,7 +100,7 @@ class TestPlan:
         torch.testing.assert_close(returns, plans.returns.float(), atol=1e-5, rtol=0)
 
     def test_goes_on_from_the_plan_that_serves_each_start_best(self):
-        """Of two plans start 0 is served by plan 1, and start 1 by plan 0, which succeeds."""
+        """Start 0 continues from plan 1, by return, and start 1 from plan 0, by success."""
         knots = torch.arange(2.0, dtype=torch.float64)[:, None, None]
         stages = []
 
@@ -123,7 +123,7 @@ class TestPlan:
 
 class TestImprove:
     def test_divides_the_gradient_of_each_start_by_its_norm(self, monkeypatch):
-        """Scales that change from iterate to iterate, by powers of two, change no bit."""
+        """Powers of two that scale the gradient of a start, by iterate, change no bit."""
         env, start, knots = begun()
         expected = improve(env, start, knots, 3, rate=2e-3)
         outcome, calls = type(env.task).outcome, []
@@ -145,7 +145,7 @@ class TestImprove:
         assert bool((found.returns > tried.returns).all())
 
     def test_keeps_the_best_iterate(self):
-        """A rate that is too large for so short an episode leaves the first one."""
+        """With a learning rate too large for so short an episode, the first iterate is best."""
         env, start, knots = begun()
         found = improve(env, start, knots, 3, rate=0.1)
         assert torch.equal(found.knots, knots)

@@ -1,4 +1,4 @@
-"""Policies without environments: their sizes and files, ONNX models, weights of other policies."""
+"""Policies without environments: sizes, files, ONNX models, weights of other policies."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ class TestExport:
         for rows in (1, 2, 5):
             seen = observation[:rows]
             (found,) = session.run(["actions"], {"observation": seen.numpy()})
-            # float32, in which both add in their own order.
+            # Both compute in float32, with different orders of summation.
             np.testing.assert_allclose(found, policy(seen).detach(), rtol=1e-5, atol=1e-6)
 
 

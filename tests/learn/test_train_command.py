@@ -1,4 +1,4 @@
-"""`diffcloth train`: results, going on after an interruption, and messages."""
+"""`diffcloth train`: results, continuation after an interruption, and messages."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_an_interrupted_training_goes_on_with_the_same_bits(config, tmp_path, mo
 
 @pytest.fixture
 def looks(monkeypatch):
-    """Success and return at each look, one after the other; and the updates at each."""
+    """Lists of success and return to report at each selection, and of the weights at each."""
     given, at = [], []
     real = train_module.evaluate
 
@@ -122,7 +122,7 @@ def looks(monkeypatch):
 
 
 def test_the_best_policy_is_kept_and_reported(config, tmp_path, looks):
-    """By success, then by return, at five looks of seven evaluations; the first of equals."""
+    """Best by success, then return, at five of seven evaluations; the first in a tie."""
     given, at = looks
     given[:] = [(False, 3.0), (True, 1.0), (True, 2.0), (True, 2.0), (False, 9.0)]
     out = tmp_path / "out"

@@ -162,7 +162,7 @@ class TestPlan:
                 observation, *_ = trainer._env.step(action)
 
     def test_sees_the_time(self):
-        """The plan moves with the time of the environment, and nothing else does here."""
+        """Actions change with the time of the environment by the plan alone."""
         trainer = Trainer(fold(), TrainerOptions("apg", horizon=3, plan_knots=9), num_envs=2)
         plan = trainer.policy.actor.plan
         with torch.no_grad():
@@ -206,7 +206,7 @@ class TestTensorAdam:
     """Adam with one scale for each tensor."""
 
     def test_is_adam_where_numbers_are_alone(self):
-        """For tensors of one number, torch's Adam has the same scales."""
+        """For tensors of one number, the scales equal the scales of torch's Adam."""
         ours, theirs = (
             [torch.tensor([0.3], requires_grad=True), torch.tensor(-2.0, requires_grad=True)]
             for _ in range(2)
@@ -247,7 +247,7 @@ class TestTensorAdam:
         np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-4, atol=1e-5)
 
     def test_moves_little_what_counts_little(self):
-        """The first step is along the gradient; Adam's first step has equal entries."""
+        """The first step is along the gradient; entries of Adam's first step have equal size."""
         moved = {}
         for scale in ("number", "tensor"):
             options = TrainerOptions(
@@ -268,7 +268,7 @@ class TestTensorAdam:
         torch.testing.assert_close(
             moved["tensor"], -0.1 * gradient / gradient.square().mean().sqrt(), rtol=1e-3, atol=1e-5
         )
-        # Adam adds 1e-8 to the size of a gradient, of which the least ones are 1e-6.
+        # Adam adds 1e-8 to the size of a gradient; the smallest gradients are about 1e-6.
         torch.testing.assert_close(moved["number"], -0.1 * gradient.sign(), rtol=0.03, atol=1e-4)
 
 
@@ -289,10 +289,10 @@ def test_lambda_returns_are_those_of_the_recursion():
 
 
 class TestEntropy:
-    """Entropy of SAPO: its value, its weight, and its effect on policy and critics."""
+    """Entropy of SAPO: value, temperature, and effect on policy and critics."""
 
     def test_is_that_of_the_density(self):
-        """Minus the log density of torch.distributions, also at the edges of the range."""
+        """Equal to minus the log density of torch.distributions, also at the bounds of actions."""
         first = torch.tensor([0.0, 0.95, -0.3])
         torch.manual_seed(0)
         actor = Actor(4, first, [8], 0.3, sees_width=True)
@@ -322,13 +322,13 @@ class TestEntropy:
             assert sign * (trainer.policy.temperature - before) > 0
 
     def test_is_part_of_the_loss_and_of_what_critics_learn(self):
-        """If the entropy bonus dominates rewards, loss and critic targets are the entropy's."""
+        """If the entropy bonus dominates rewards, it determines loss and critic targets."""
         options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, gae_lambda=1.0)
         trainer = Trainer(fold(), options, num_envs=2)
         (rollout,) = trainer._rollouts()
         worth = sum(0.5**t * rollout.entropies[t] for t in range(3)).mean()
         assert rollout.loss == pytest.approx(-1e4 * float(worth) / 3, rel=1e-3)
-        # Values are near zero at first, so their errors equal the entropy bonus.
+        # Initial values are nearly zero, so critic errors equal the entropy bonus.
         assert trainer._fit_critics(_Rows([rollout])) > 1e6
 
     def test_critics_differ_and_their_least_is_learned(self, monkeypatch):
@@ -491,7 +491,7 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
 
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 def test_a_failure_costs_all_that_is_left(algorithm, monkeypatch):
-    """The cost counts in evaluations (compared by tryouts), rollouts and critic targets."""
+    """Evaluations (compared by tryouts), rollouts and critic targets include the cost."""
     from diffcloth_torch.envs import env as module
 
     worst, horizon = FoldCloth.worst, 6
@@ -511,7 +511,7 @@ def test_a_failure_costs_all_that_is_left(algorithm, monkeypatch):
     rows = _Rows([rollout])
     values = torch.full_like(rows.rewards, 100.0)
     goals = _lambda_returns(rows, rows.rewards, values, 1.0, 1.0)
-    assert float(goals[1, 1]) == worst * (horizon - 1)  # nothing follows a failure
+    assert float(goals[1, 1]) == worst * (horizon - 1)  # no value after a failure
     assert float(goals[0, 1]) == pytest.approx(float(rollout.rewards[0, 1]) + worst * (horizon - 1))
     monkeypatch.setattr(module, "failures", lambda state: torch.tensor([True, True]))
     mean, success, _ = trainer.evaluate(2)
@@ -539,10 +539,10 @@ def lift_corner(num_envs):
 
 
 class CarryStrip(Task):
-    """A strip hangs from its upper edge, which a hand moves; its center must move by 6 cm.
+    """A strip hangs from its upper edge, which a hand moves; the center must move by 6 cm.
 
-    The distance is a smooth function of every action. Training therefore does not wait for a first
-    success, whose time would depend on rounding.
+    The distance is a smooth function of every action. Improvement therefore does not depend on a
+    first success, at a time that would depend on rounding.
     """
 
     name = "CarryStrip"

@@ -63,7 +63,7 @@ def divide(number):
 
 
 def dies_in_its_first_worker(path, main, num_envs):
-    """Make environments, but kill the first worker process that makes them."""
+    """Make environments, but kill the first worker process that calls this function."""
     if os.getpid() != main and not path.exists():
         path.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -111,7 +111,7 @@ def test_unfinished_pieces_of_a_dead_process_are_repeated(tmp_path):
 
 
 class TwoArgumentsError(Exception):
-    """An error whose pickle cannot be read, because it stores one argument of two."""
+    """An error that cannot be unpickled, because its pickle has one argument of two."""
 
     def __init__(self, what, where):
         super().__init__(f"{what} in {where}")
