@@ -65,7 +65,7 @@ def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bo
     print(f"{chunks} chunks of {chunk} environments, {size} x {size}; "
           f"{'the same bits' if len(bits) == 1 else 'BITS DIFFER'}")  # fmt: skip
     print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    print("                      s an update      of n  on idle cores   environment steps a second")
+    print("                      s per update     of n  on idle cores   environment steps a second")
     here, core = (statistics.median(part) for part in zip(*times["here"], strict=True))
     for name, spent in times.items():
         middle, mine = (statistics.median(part) for part in zip(*spent, strict=True))
@@ -96,7 +96,7 @@ def _messages(trainer: Trainer, chunk_seconds: float) -> None:
         spent = (time.process_time() - start) / _REPEATS
         seconds += spent
         print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * spent:.2f} ms")
-    print("workers   s an update   efficiency, if messages pass one by one")
+    print("workers   s per update  efficiency, if messages pass one by one")
     for count in (2, 4, 8, 16, 32, 64, 128):
         update = chunk_seconds + count * seconds
         print(f"{count:7d} {update:13.3f} {chunk_seconds / update:12.0%}")
