@@ -1,19 +1,19 @@
-"""Fits to data of a fine time step: what the time step of the fit does to the numbers.
+"""Fits to data of a fine time step: effect of the time step of the fit on the numbers.
 
     python -m benchmarks.step_bias                 # all scenes: about ten minutes
     python -m benchmarks.step_bias swing slide --data second_order
     python -m benchmarks.step_bias --quick swing   # a small form: shows that it runs
 
 Data at h = .00125 s, one frame in .03 s, 40 % of the markers missing, are fitted at h = .01 s. The
-data are those of implicit Euler, which have an eighth of its bias themselves, or with
-`--data second_order` those of the second-order step. Rows:
+data come from implicit Euler, with an eighth of the bias of the fit, or, with
+`--data second_order`, from the second-order step. Rows:
 
 euler          implicit Euler
-its shift      the same with the shift of `Fit.step_bias`, from h = .005 s
+its shift      implicit Euler with the shift of `Fit.step_bias`, from h = .005 s
 extrapolated   a fit of `residuals.extrapolated`, h = .01 and .005 s
 second_order   `integrator="second_order"`, and below it with its shift
 
-Columns: processor time over that of the first row, root mean square of the residuals in units of
+Columns: processor time relative to the first row, root mean square of the residuals in units of
 the noise, and each number with the half width of its interval ("white noise").
 """
 
@@ -43,20 +43,20 @@ INTEGRATORS = ("implicit_euler", "second_order")
 
 Values = Mapping[str, Tensor]
 Motion = Callable[[Values, int], Sequence[dc.State]]
-"""From values of all variables, and a number of steps, to the states."""
+"""Function from values of all variables, and a number of steps, to the states."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """A motion whose numbers are known.
+    """A motion with known numbers.
 
     Attributes:
-        make: From the time step and the integrator to the motion.
+        make: Function from the time step and the integrator to the motion.
         truth: Name of each number -> its true value.
         first: First values of the fit.
         frames: Number of frames.
         noise: Standard deviation of a coordinate [m].
-        bounds: Of single numbers.
+        bounds: Name of a number -> its bounds; default bounds for all others.
     """
 
     make: Callable[[float, str], Motion]
@@ -68,7 +68,7 @@ class Study:
 
 
 def swing(h: float, integrator: str, rows: int = 9) -> Motion:
-    """A sheet that is let go from the horizontal, turning about its pinned edge, in air."""
+    """A sheet that is released from the horizontal and turns about its pinned edge, in air."""
     material = dc.Material(stretch=100.0, bending=3e-5, density=0.15, damping=2e-3, normal_drag=1.1)
     cloth = dc.Cloth.grid(rows, rows, 0.4, pins={"edge": range(rows)}, material=material)
     sim = simulator(dc.Scene([cloth]), h, integrator)
@@ -190,7 +190,7 @@ def simulator(scene: dc.Scene, h: float, integrator: str, **contact: float) -> d
 
 
 def given(sim: dc.Simulator, values: Values) -> dc.Parameters:
-    """The parameters of a simulator, with those of the values that are some."""
+    """Default parameters of a simulator, replaced by the values named like fields."""
     fields: Any = {n: v for n, v in values.items() if n in dc.Parameters.__dataclass_fields__}
     return sim.default_parameters().replace(**fields)
 
@@ -208,7 +208,7 @@ def rollout(
 
 @dataclass(frozen=True)
 class Row:
-    """What one way found: values, half widths, root mean square and processor time [s]."""
+    """Result of one way: values, half widths, root mean square and processor time [s]."""
 
     way: str
     values: dict[str, float]
@@ -244,7 +244,7 @@ def run(study: Study, data: str = INTEGRATORS[0], *, quick: bool = False) -> lis
 
     coarse, fine = compared(STEP, INTEGRATORS[0]), compared(HALF, INTEGRATORS[0])
     second = compared(STEP, INTEGRATORS[1])
-    for residuals in (coarse, fine, second):  # what is built and compiled once is not counted
+    for residuals in (coarse, fine, second):  # excludes one-time compilation from the times
         _fit(study, study.first, residuals, max_evaluations=1)
     found, seconds = _fit(study, study.first, coarse)
     rows = [_row("euler", found, seconds)]

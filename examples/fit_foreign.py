@@ -3,9 +3,9 @@
     python examples/fit_foreign.py
 
 The recording comes from masses and springs, integrated explicitly: springs that stiffen with their
-strain, springs over two edges, and air. A camera sees markers at 30 Hz, with a clock and a place
-of its own, an error of 2 mm, and 40 % of them hidden. The fit knows none of the springs. It
-searches the stretch stiffness, the drag, the speed at the start, and the delay of the camera.
+strain, springs over two edges, and air. A camera sees markers at 30 Hz with its own, late clock and
+an error of 2 mm; 40 % of the markers are hidden. The fit has no model of the springs. The fitted
+numbers are the stretch stiffness, the drag, the speed at the start, and the delay of the camera.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ import diffcloth_torch as dc
 Array = NDArray[np.float64]
 
 ROWS, SIDE, DENSITY = 7, 0.3, 0.2  # vertices of a side; [m], [kg/m^2]
-DRAG, SPEED, DELAY = 1.2, 2.0, 0.015  # what is to be found: [-], [rad/s], [s]
+DRAG, SPEED, DELAY = 1.2, 2.0, 0.015  # true values of fitted numbers: [-], [rad/s], [s]
 RATE, FRAMES, SEEN_FROM = 30.0, 14, 0.05  # the camera: [Hz], count, its first time [s]
 DAMPING = 2e-3  # of each spring, along it [N s/m]
 NOISE, HIDDEN = 2e-3, 0.4  # [m], share of the markers
 
 
 class Springs(NamedTuple):
-    """Pairs of masses, the stiffness of each [N/m], and how much it stiffens with strain."""
+    """Pairs of masses, the stiffness of each pair [N/m], and its increase with squared strain."""
 
     pairs: NDArray[np.int64]
     stiffness: Array

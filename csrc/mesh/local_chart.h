@@ -43,7 +43,7 @@ void for_each_rest_edge(const Topology& topology, std::size_t e, const Function&
   if (edge.is_seam()) function(edge.last[0], edge.last[1], share);
 }
 
-/// The points of a chart that has no others than its base face, from that face's rest vertices.
+/// Points of a chart that consists of its base face alone, from the rest vertices of that face.
 inline std::array<Unfolding, 3> base_points(const std::array<Index, 3>& rest_face) {
   const Unfolding corner{.edge = {-1, -1}, .rest = rest_face};
   return {corner, corner, corner};

@@ -47,8 +47,8 @@ struct Unfolding {
 struct BendingStencils {
   std::vector<Index> start{0};              ///< [B + 1] into `vertices`
   std::vector<Index> vertices;              ///< [start.back()]
-  std::vector<Index> rest_vertices;         ///< [start.back()] of elements that are not sewn
-  std::vector<char> sewn;                   ///< [B] whether a seam crosses it: it is flat at rest
+  std::vector<Index> rest_vertices;         ///< [start.back()] for elements without seams
+  std::vector<char> sewn;                   ///< [B] true if a seam crosses it: flat at rest
   std::vector<std::array<Index, 2>> faces;  ///< [B] base face; other face of a hinge or -1
   std::vector<BendingModel> model;          ///< [B]
   std::vector<FittedSide> sides;            ///< [S]
@@ -93,7 +93,7 @@ struct RestShape {
   /// [start.back()] x 3: the weights (c_uu, c_uv, c_vv) of each stencil vertex,
   /// x,ab = sum_i c_ab,i x_i [1/m^2].
   std::vector<double> curvature_operator;
-  /// [B] columns b_uu, b_uv, b_vv: second derivatives X,ab in the rest frame (r1, r2, n) [1/m]; 0 of
+  /// [B] columns b_uu, b_uv, b_vv: second derivatives X,ab in the rest frame (r1, r2, n) [1/m]; 0 for
   /// sewn elements.
   std::vector<Mat3> curvature;
   std::vector<double> bending_area;    ///< [B] weight of an element: A of a patch, 1 of a hinge

@@ -65,7 +65,7 @@ class Patch {
  private:
   struct Unfolded {
     Index face;
-    std::array<Index, 3> corner;  ///< indices of its corners, counterclockwise in the plane
+    std::array<Index, 3> corner;  ///< indices of the corners, counterclockwise in the plane
   };
 
   Index place(Index v) const {

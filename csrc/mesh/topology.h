@@ -7,7 +7,7 @@
 
 namespace diffcloth::mesh {
 
-/// An edge in the rest mesh, as its first and its last face have it; at a seam these differ.
+/// Rest vertices of an edge in its first and in its last face; both pairs differ at a seam.
 struct RestEdge {
   std::array<Index, 2> first, last;
 

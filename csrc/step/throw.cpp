@@ -23,7 +23,7 @@
 //   E(s) = sum over its contacts of (d'_i / d') kappa w m b((d + s d')^2),
 //
 // its first step ends at the minimum of  mu s^2 / 2 + E(s) - l s.  The energy stored there, down to the
-// balance of push and load, becomes kinetic energy at most. The speed is that of implicit Euler, which
+// balance of push and load, becomes kinetic energy at most. The speed follows from implicit Euler, which
 // dissipates most of the energy if a step is longer than the barrier's time scale: 99 % at 10 ms with a
 // default barrier stiffness.
 

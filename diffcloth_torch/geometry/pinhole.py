@@ -1,9 +1,10 @@
-"""Triangles that a pinhole camera sees: the nearest one along the ray of each pixel.
+"""Triangles that a pinhole camera sees: the nearest triangle along the ray of each pixel.
 
-A ray d meets the plane of a triangle with corners a, b, c, as seen from the camera, at barycentric
-coordinates that are the products of d with b x c, c x a and a x b, divided by their sum. The depth
-there is a . (b x c) / the sum: homogeneous rasterization after M. Olano and T. Greer,
-"Triangle scan conversion using 2D homogeneous coordinates", 1997. It needs no clipping.
+Let a, b, c be the corners of a triangle relative to the camera. A ray d meets the plane of the
+triangle at barycentric coordinates that are the products of d with b x c, c x a and a x b, divided
+by the sum of these products. The depth of the meeting point is a . (b x c) / the sum. This is
+homogeneous rasterization after M. Olano and T. Greer, "Triangle scan conversion using 2D
+homogeneous coordinates", 1997, which needs no clipping.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ __all__ = ["Seen", "nearest_triangles"]
 
 Indices = NDArray[np.integer[Any]]
 
-_WIDER = 1e-6  # bounds of a triangle in the picture [pixels]
-_OUTSIDE = 1e-9  # of barycentric coordinates: by rounding no ray passes between neighbors
+_WIDER = 1e-6  # margin of the bounds of a triangle in the picture [pixels]
+_OUTSIDE = 1e-9  # tolerance of barycentric coordinates: no ray passes between neighbors by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,8 @@ class Seen:
     Attributes:
         triangles: Index of the nearest triangle, -1 without one, [H, W].
         weights: Barycentric coordinates of the meeting point, 0 without one, [H, W, 3].
-        depths: Its distance along the axis of the camera, infinite without one, [H, W].
+        depths: Distance of the meeting point along the axis of the camera, infinite without one,
+            [H, W].
     """
 
     triangles: Indices
@@ -45,9 +47,9 @@ def nearest_triangles(
     """Find the triangle that each pixel sees through its center, from either side.
 
     Args:
-        vertices: In axes of the camera: x to the right, y down, z forward; [n, 3].
+        vertices: Positions in axes of the camera: x to the right, y down, z forward; [n, 3].
         faces: Indices of corners, [f, 3].
-        focal_length: In pixels; the axis passes through the middle of the picture.
+        focal_length: Focal length [pixels]; the axis passes through the middle of the picture.
         size: Rows H and columns W.
     """
     height, width = size
@@ -60,12 +62,12 @@ def nearest_triangles(
     normals = across[triangles]
     shares = normals[..., 0] * x[:, None] + normals[..., 1] * y[:, None] + normals[..., 2]
     total = shares.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of triangles that are seen edge on
+    with np.errstate(divide="ignore", invalid="ignore"):  # for triangles seen edge on
         weights, depths = shares / total[:, None], volumes[triangles] / total
     meets = (weights >= -_OUTSIDE).all(axis=1) & (depths > 0) & np.isfinite(depths)
     triangles, pixels = triangles[meets], (rows * width + columns)[meets]
     weights, depths = weights[meets], depths[meets]
-    # Of several values that are assigned to a pixel the last one stays: the nearest.
+    # The last of several values assigned to a pixel stays: the nearest triangle is last.
     order = np.lexsort((triangles, depths))[::-1]
     nearest = np.full(height * width, -1)
     nearest[pixels[order]] = order
@@ -85,9 +87,9 @@ def nearest_triangles(
 def _pixels_in_bounds(
     vertices: FloatArray, faces: Indices, focal_length: float, size: tuple[int, int]
 ) -> tuple[Indices, Indices, Indices]:
-    """Triangles [n], and rows and columns of the pixels that their bounds in the picture hold.
+    """Triangles [n], and rows and columns of the pixels within their bounds in the picture.
 
-    A triangle that is in part behind the camera has no bounds: all pixels are in them.
+    The bounds of a triangle that is partly behind the camera are the whole picture.
     """
     behind = vertices[:, 2] <= 0
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -1,4 +1,4 @@
-"""Texture coordinates as a flat rest mesh, which is cut where the texture is."""
+"""Texture coordinates as a flat rest mesh, cut at the seams of the texture."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class RestMesh(NamedTuple):
     """A rest mesh with vertices of its own.
 
     Attributes:
-        positions: Its vertices [m], [r, 3].
-        faces: The faces of the cloth among them, [f, 3].
+        positions: Rest vertices [m], [r, 3].
+        faces: Faces of the cloth as indices of rest vertices, [f, 3].
     """
 
     positions: FloatArray
@@ -30,16 +30,16 @@ class RestMesh(NamedTuple):
 def flat_rest_mesh(
     owner: str, faces: Indices, texture: FloatArray | None, scale: float
 ) -> RestMesh:
-    """The triangles of the texture, in the xy-plane with u along x.
+    """Make a rest mesh of the triangles of the texture, in the xy-plane with u along x.
 
     A vertex has a rest vertex for each of its places in the texture, in the order of the vertices;
     without seams the rest mesh therefore has the indices of the mesh.
 
     Args:
-        owner: Opens messages.
+        owner: Beginning of messages.
         faces: Triangles, [f, 3]; each vertex belongs to one.
-        texture: Texture coordinates of their corners, [f, 3, 2], NaN where there are none; None
-            where the format has none.
+        texture: Texture coordinates of the corners of the triangles, [f, 3, 2], NaN for corners
+            without coordinates; None if the format has no texture.
         scale: Meters per unit of the texture coordinates.
 
     Raises:
@@ -60,7 +60,7 @@ def flat_rest_mesh(
 
 
 def _refuse_folds(owner: str, flat: FloatArray, faces: Indices) -> None:
-    """Refuse edges both of whose faces lie on one side of them, where no seam cuts them apart."""
+    """Refuse edges without a seam whose two faces lie on the same side of the edge."""
     sides = faces[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)  # two ends, other corner
     ends = np.sort(sides[:, :2], axis=1)
     (u, v), (x, y) = ((flat[i] - flat[ends[:, 0]]).T for i in (ends[:, 1], sides[:, 2]))

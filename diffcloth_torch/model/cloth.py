@@ -56,15 +56,15 @@ class Cloth:
         material: Material of the sheet.
         pins: Name -> indices of vertices whose motion is prescribed.
         soft_pins: Name -> indices of vertices that springs pull to targets.
-        pin_stiffness: Stiffness of each of these springs [N/m].
-        rest_positions: Vertices of the rest mesh, in which the cloth is free of stress [m], shape
-            [r, 3]; r = n without seams.
-        rest_faces: The faces in the rest mesh, indices into `rest_positions`, shape [f, 3]; `faces`
+        pin_stiffness: Stiffness of each spring of a soft pin [N/m].
+        rest_positions: Vertices of the stress-free rest mesh [m], shape [r, 3]; r = n without
+            seams.
+        rest_faces: Faces of the rest mesh, indices into `rest_positions`, shape [f, 3]; `faces`
             without seams.
         bending_model: "patch" (isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
         directions: Direction of the warp at rest, shape [3], or one per face, shape [f, 3].
-        file_vertices: Vertex that stands for each vertex of the file that `load` has read, shape
+        file_vertices: For each vertex of the file read by `load`, its vertex of the cloth, shape
             [m]; None for other cloths.
     """
 
@@ -105,18 +105,18 @@ class Cloth:
             material: Material; its arrays hold one value per face.
             pins: Name -> indices of vertices whose motion is prescribed.
             soft_pins: Name -> indices of vertices that springs pull to targets.
-            pin_stiffness: Stiffness of each of these springs [N/m], > 0.
+            pin_stiffness: Stiffness of each spring of a soft pin [N/m], > 0.
             rest_positions: Stress-free positions [m], shape [n, 3], or [r, 3] with `rest_faces`;
                 `vertices` by default.
-            rest_faces: The faces in a rest mesh that is cut at seams, indices into
-                `rest_positions`, shape [f, 3]. Each face has its own triangle at rest, and a vertex
-                of a seam several rest vertices. Seams are sewn flat: the angle between the faces at
-                both sides is zero at rest. By default no seams.
+            rest_faces: Faces of a rest mesh that is cut at seams, indices into `rest_positions`,
+                shape [f, 3]. Each face has its own triangle at rest, and a vertex of a seam has
+                several rest vertices. Seams are sewn flat: the angle between the faces at both
+                sides is zero at rest. By default the rest mesh has no seams.
             bending_model: "patch" or "hinge".
             name: Name in the scene.
             directions: Direction of the warp in the rest shape, shape [3] or [f, 3]; along x by
-                default. It is projected onto each face and fixed to the material, also where
-                `Parameters.rest_positions` are others. Isotropic cloth has no use for it.
+                default. The direction is projected onto each face and fixed to the material, also
+                if `Parameters.rest_positions` differ. Isotropic cloth does not use it.
             pose: Pose [px, py, pz, qw, qx, qy, qz] that places `vertices`, but not the rest shape;
                 the identity by default.
 
@@ -146,15 +146,15 @@ class Cloth:
 
     @property
     def has_seams(self) -> bool:
-        """Whether the rest mesh is cut, so that some vertices have several rest vertices."""
+        """Return whether the rest mesh is cut, so that some vertices have several rest vertices."""
         return len(self.rest_positions) > len(self.vertices)
 
     @property
     def rest_embedding(self) -> FloatArray:
         """Positions of the vertices at rest [m], shape [n, 3].
 
-        With seams no such positions may exist. Then they are those of `vertices`, scaled to the
-        area of the rest mesh.
+        A cloth with seams may have no such positions; the result then equals `vertices`, scaled to
+        the area of the rest mesh.
         """
         if self.has_seams:
             areas = (
@@ -171,7 +171,7 @@ class Cloth:
         """Unit vectors of the warp in the rest frames of the faces, shape [f, 2].
 
         Args:
-            owner: Opens the message of the error where a direction is normal to a face.
+            owner: Beginning of the error message if a direction is normal to a face.
         """
         return material_axes(owner, self.directions, self.rest_positions, self.rest_faces)
 
@@ -187,23 +187,25 @@ class Cloth:
         weld: float | None = None,
         **keywords: Any,
     ) -> Cloth:
-        """Read an .obj, .ply or .stl file; but for .stl, vertex `i` of it is that of the cloth.
+        """Read an .obj, .ply or .stl file.
 
         >>> flag = dc.Cloth.load("flag.obj", rest="uv", rest_scale=1.5)
 
-        A mesh of more than 10 m or less than 1 mm gets a warning about `scale`.
+        Vertex `i` of an .obj or .ply file is vertex `i` of the cloth unless `weld` merges vertices.
+        A mesh of more than 10 m or less than 1 mm causes a warning about `scale`.
 
         Args:
             path: Mesh file.
             scale: Meters per unit of the file, > 0.
-            rest: "uv" takes the triangles of the texture of an .obj file as rest shape, flat in the
+            rest: "uv" uses the triangles of the texture of an .obj file as rest shape, flat in the
                 xy-plane, with u along x. The islands of the texture may lie anywhere, also mirrored
-                or on each other. Seams between them are sewn flat, as with `rest_faces`.
+                or on each other. Seams between islands are sewn flat, as with `rest_faces`.
             rest_scale: Meters per unit of the texture coordinates, > 0; required for `rest`.
             triangulate: Whether to cut quads and other polygons into triangles, from their shorter
                 diagonals on, instead of refusing them.
-            weld: Distance [m] up to which vertices are merged; the first one stays. With 0, those
-                at one place. `file_vertices` has the vertex that stands for each one of the file.
+            weld: Distance [m] up to which vertices are merged into the first of them; 0 merges
+                coincident vertices. `file_vertices` maps vertices of the file to vertices of the
+                cloth.
             **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` does not apply to it.
 
         Raises:
@@ -284,7 +286,7 @@ class Cloth:
 def _grid_shape(
     owner: str, arguments: Sequence[Any], keywords: dict[str, Any]
 ) -> tuple[int, int, object]:
-    """Numbers of vertices along x and y, and the size; they are taken out of the keywords."""
+    """Numbers of vertices along x and y, and the size; removes these arguments from `keywords`."""
     by_counts = "counts" in keywords or _has_an_axis(arguments[:1])
     names = ("counts", "size") if by_counts else ("rows", "columns", "size")
     if len(arguments) > len(names):
@@ -323,7 +325,7 @@ def _grid_shape(
 
 
 def _has_an_axis(values: Sequence[Any]) -> bool:
-    """Whether the only value, if there is one, is a list or an array of one axis."""
+    """Return whether a value, of none or one, is a list or an array of one axis."""
     return any(isinstance(v, list | tuple) or getattr(v, "ndim", 0) == 1 for v in values)
 
 
@@ -362,7 +364,7 @@ def _rest(
 
 
 def _rest_faces(given: object, rest_count: int, faces: IndexArray) -> IndexArray:
-    """Check the faces of the rest mesh; returns `faces` themselves if they are equal."""
+    """Check the faces of the rest mesh; return the object `faces` if the arrays are equal."""
     name = "Cloth: `rest_faces`"
     rest_faces = index_array(name, given, rest_count)
     check_shape(name, rest_faces.shape, [faces.shape])

@@ -1,4 +1,4 @@
-"""Bias of the time step or the mesh: where a fit of extrapolated residuals would end."""
+"""Bias of the time step or the mesh: solution of a fit of extrapolated residuals."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from diffcloth_torch.optimize.problem import Residuals, trajectories
 
 __all__ = ["Limit", "factor_of", "limit_of", "moves_of"]
 
-_SMALL = 0.1  # half widths below which a step needs no further one
+_SMALL = 0.1  # step in half widths below which the iteration ends
 _TINY = 1e-300
 
 
 def factor_of(owner: str, ratio: float, order: float) -> float:
-    """Factor from the change of residuals to that which is left: q^n / (q^n - 1)."""
+    """Factor from the change of residuals to the whole error: q^n / (q^n - 1)."""
     base = check_number(f"{owner}: `ratio`", ratio, RATIOS)
     power = math.pow(base, check_number(f"{owner}: `order`", order, POSITIVE))
     return power / (power - 1)
 
 
 class Limit(NamedTuple):
-    """Theta without a bias, and the size of the last step to it, in half widths of intervals."""
+    """Theta without a bias, and the size of the last step in half widths of intervals."""
 
     theta: FloatArray
     last_step: float
@@ -43,13 +43,13 @@ def limit_of(
     factor: float,
     max_evaluations: int,
 ) -> Limit:
-    """Theta of the least squares of r + factor (f - r), by Gauss-Newton steps with one Jacobian.
+    """Least-squares solution for r + factor (f - r), by Gauss-Newton steps with one Jacobian.
 
     Args:
-        owner: Operation that a message names.
+        owner: Operation named in messages.
         model: Linear model of the fit.
-        coarse: The residuals r of the fit, for more than one evaluation.
-        finer: The residuals f with a smaller error.
+        coarse: Residuals r of the fit; needed for more than one evaluation.
+        finer: Residuals f with a smaller error.
         factor: See `factor_of`.
         max_evaluations: Largest number of evaluations of `finer`.
     """
@@ -69,7 +69,7 @@ def limit_of(
 
 
 def moves_of(model: Linearized, at: FloatArray) -> str:
-    """Describe the numbers that moved by more than the half width of their interval."""
+    """Describe the numbers whose shift exceeds the half width of their interval."""
     shares = np.abs(at - model.theta) / np.maximum(model.half_widths, _TINY)
     before, after = model.space.from_theta(model.theta), model.space.from_theta(at)
     return ", ".join(

@@ -1,4 +1,4 @@
-"""What residuals compare: noted while they are evaluated, for the page of a fit."""
+"""Simulated and observed points, recorded during an evaluation for the page of a fit."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class Comparison:
 
     Attributes:
         kind: "markers", "point_cloud" or "outline".
-        times: Of the frames [s], shape [T].
-        simulated: Of each frame the simulated points [m], shape [n, 3] or [n, 2].
-        observed: The observed ones, likewise; NaN where one was not seen.
-        placed: The observed ones beside the states: an outline that was turned lies as they do.
+        times: Times of the frames [s], shape [T].
+        simulated: Simulated points of each frame [m], shape [n, 3] or [n, 2].
+        observed: Observed points of each frame [m], likewise; NaN for unseen points.
+        placed: Observed points in the orientation of the states, for outlines with `turned` too.
         labels: Name of each point of a frame: its vertex, direction or number.
         noise: Standard deviation of an observation [m].
-        used: Of markers, coordinates that have a residual, shape [T, n, 3]; else None.
+        used: For markers, True for coordinates with a residual, shape [T, n, 3]; else None.
     """
 
     kind: str
@@ -68,7 +68,7 @@ _NOTES: ContextVar[list[Comparison] | None] = ContextVar("_NOTES", default=None)
 
 @contextmanager
 def noting() -> Iterator[list[Comparison]]:
-    """Collect what is compared inside."""
+    """Collect the comparisons noted within this context."""
     notes: list[Comparison] = []
     token = _NOTES.set(notes)
     try:
@@ -78,17 +78,17 @@ def noting() -> Iterator[list[Comparison]]:
 
 
 def note(comparison: Comparison) -> None:
-    """Keep a comparison, if somebody collects."""
+    """Record a comparison if a `noting` context is active."""
     notes = _NOTES.get()
     if notes is not None:
         notes.append(comparison)
 
 
 def blocks_of(owner: str, found: object) -> dict[str, Tensor]:
-    """The blocks that a residual function returned: name -> tensor, whose first axis is time.
+    """Blocks that a residual function returned: name -> tensor, whose first axis is time.
 
     Raises:
-        TypeError: If it returned something else than a tensor, a list of tensors, or a dict of
+        TypeError: If the function returned neither a tensor, a list of tensors, nor a dict of
             name -> tensor.
     """
     if isinstance(found, Tensor):
@@ -105,7 +105,7 @@ def blocks_of(owner: str, found: object) -> dict[str, Tensor]:
 
 
 def positions_of(owner: str, states: Sequence[State]) -> Tensor:
-    """Positions of states without a batch axis [T, N, 3]; refuses anything else."""
+    """Positions of states without a batch axis [T, N, 3]; other input is refused."""
     given: Any = states
     if isinstance(given, State):
         raise TypeError(f"{owner}: `states` must be a list of State, got one State")
@@ -152,5 +152,5 @@ def checked_points(name: str, value: object) -> FloatArray:
 
 
 def checked_noise(owner: str, noise: float) -> float:
-    """A standard deviation; refuses what is not a positive number."""
+    """Return a standard deviation; require a positive number."""
     return check_number(f"{owner}: `noise`", noise, POSITIVE)

@@ -38,10 +38,10 @@ Variables = Mapping[str, Tensor]
 """Name -> leaf tensor that requires a gradient."""
 
 Simulate = Callable[[Variables], Sequence[State]]
-"""From variables to the states that the loss looks at."""
+"""Function from variables to the states that the loss depends on."""
 
 Loss = Callable[[Sequence[State]], Tensor]
-"""From states to a loss of shape [], or [B] with one for each environment."""
+"""Function from states to a loss of shape [], or [B] with one number per environment."""
 
 _MAY_BE_UNKNOWN = ("minimum_distance", "cpu_seconds")
 _CONVERGED = "converged"
@@ -86,7 +86,7 @@ class Evaluation:
         return [i for i, loss in enumerate(self.environment_losses) if loss is None]
 
     def is_better_than(self, other: Evaluation | None) -> bool:
-        """Whether fewer environments failed, or equally many and the loss is smaller."""
+        """Return whether fewer environments failed, or as many did and the loss is smaller."""
         if other is None:
             return True
         failures = [len(found.failed_environments) for found in (self, other)]
@@ -106,10 +106,10 @@ class Evaluation:
 
 
 def restored(name: str, given: Mapping[str, Any], variables: Mapping[str, Tensor]) -> Evaluation:
-    """Make an evaluation from its fields, of a loop over variables like the given ones.
+    """Make an evaluation from its fields, for a loop over variables like the given ones.
 
     Raises:
-        InvalidInput: If it has other fields, or they do not fit; the message opens with the name.
+        InvalidInput: If fields are missing, unknown or do not fit; the message opens with the name.
     """
     names = [field.name for field in fields(Evaluation)]
     check_like(name, dict.fromkeys(given), dict.fromkeys(names))
@@ -127,7 +127,7 @@ def check_record(name: str, given: Any) -> None:
     """Require the numbers of a `record` of an evaluation.
 
     Raises:
-        InvalidInput: If any is missing, or is none; the message opens with the name.
+        InvalidInput: If an entry is missing or no number; the message opens with the name.
     """
     example = {"loss": 0.0, "forward_seconds": 0.0, "backward_seconds": 0.0, "gradient_norms": {}}
     example |= rollout_statistics([]) | {"cpu_seconds": 0.0}
@@ -151,15 +151,16 @@ def evaluate(
 ) -> Evaluation:
     """Simulate, and store the gradient of the loss in the `.grad` of the variables.
 
-    A loss with one number for each environment leaves out those that failed; with any other loss a
-    failed environment is an error.
+    If the loss has one number for each environment, failed environments are left out; with any
+    other loss a failed environment is an error.
 
     Args:
         simulate: Function from variables to states.
         loss: Function from states to a loss of shape [] or [B].
         variables: Name -> leaf tensor.
-        per_environment: Names of variables whose row i acts in environment i alone; each row gets
-            the gradient of its own environment's loss, the other variables that of the mean.
+        per_environment: Names of variables whose row i acts in environment i alone. Each row
+            receives the gradient of its environment's loss; all other variables receive the
+            gradient of the mean loss.
 
     Raises:
         InfeasibleMotion: If steps failed with this status, and no environment is left.
@@ -220,7 +221,7 @@ def _check_shape(values: Tensor, states: Sequence[State]) -> None:
 
 
 def _failures(states: Sequence[State]) -> dict[int, tuple[int, str]]:
-    """Environments that failed -> index of the first state after it, and its status."""
+    """Failed environment -> index of the first state after the failed step, and its status."""
     failures: dict[int, tuple[int, str]] = {}
     for k, state in enumerate(states):
         status = () if state.report is None else state.report.status
@@ -233,7 +234,7 @@ def _failures(states: Sequence[State]) -> dict[int, tuple[int, str]]:
 def _total(
     values: Tensor, failures: Mapping[int, tuple[int, str]]
 ) -> tuple[Tensor, list[float | None]]:
-    """The loss to differentiate, and that of each environment, empty if it is one number."""
+    """The loss to differentiate, and the loss of each environment (empty if shape [])."""
     left = [i for i in range(len(values)) if i not in failures] if values.dim() else []
     if failures and not left:
         raise _error(failures)
@@ -255,7 +256,7 @@ def _total(
 def _error(failures: Mapping[int, tuple[int, str]]) -> SimulationError:
     k, status = min(failures.values())
     environments = sorted(failures)
-    # Any other status comes from a file: a step would raise it.
+    # Any other status comes from a file: a step raises an error instead.
     kind = _ERRORS.get(status, SimulationError)
     return kind(
         f"the step to the state [{k}] of the rollout has the status {status!r}; environments "

@@ -21,7 +21,7 @@ RATIOS = Range(1.0)
 
 @dataclass(frozen=True, eq=False)
 class _Extrapolated:
-    """Weighted sum of residuals, one function for each time step; can be sent to a process."""
+    """Weighted sum of residuals, one function for each time step; can be pickled."""
 
     levels: tuple[Callable[..., Any], ...]
     weights: tuple[float, ...]
@@ -45,7 +45,7 @@ class _Extrapolated:
         return sum(weight * part for weight, part in zip(self.weights, parts, strict=True))
 
     def _compared(self, levels: Sequence[Comparison]) -> Comparison:
-        """The extrapolated positions beside those observed."""
+        """Comparison of extrapolated with observed positions."""
         frames = zip(*(level.simulated for level in levels), strict=True)
         return replace(levels[-1], simulated=[self._sum(frame) for frame in frames])
 
@@ -61,24 +61,24 @@ def extrapolated(
     """Residuals of a simulation with the time step h, extrapolated to a time step of zero.
 
     Implicit Euler has an error of first order, r(h) = r(0) + a h + b h^2 + ... where the motion is
-    smooth. Residuals of two time steps, `2 fine - coarse` for the ratio 2, have an error of second
-    order; those of three, of third order (Richardson, 1911). For `integrator="second_order"` give
-    `order=2`: the weights of two time steps are then 4/3 and -1/3. Impacts, changes between
-    sticking and slipping, and buckling are not smooth in h: check such a motion with a third time
-    step.
+    smooth. A combination of two time steps, `2 fine - coarse` for the ratio 2, has an error of
+    second order; a combination of three has third order (Richardson, 1911). For
+    `integrator="second_order"` use `order=2`: the weights of two time steps are then 4/3 and -1/3.
+    Impacts, changes between sticking and slipping, and buckling are not smooth in h: check such a
+    motion with a third time step.
 
-    Only residuals that are linear in positions can be combined, as `markers`. `point_cloud` and
-    `outline` choose the nearest vertex or edge in each simulation anew, and are refused.
+    Only residuals that are linear in positions, such as `markers`, can be combined. `point_cloud`
+    and `outline` choose the nearest vertex or edge anew in each simulation, and are refused.
 
     Args:
-        coarse: Residuals of the simulation with the time step h, as those of `fit`.
-        fine: The same at h / ratio, with as many residuals in the same order.
-        finer: The same at h / ratio^2; None combines two time steps.
+        coarse: Residuals of the simulation with the time step h, as for `fit`.
+        fine: Residuals with the time step h / ratio, as many and in the same order.
+        finer: Residuals with the time step h / ratio^2, likewise; None combines two time steps.
         ratio: Ratio of two successive time steps, > 1.
-        order: Power of h in the error, > 0; that of the next term is larger by one.
+        order: Power of h in the error, > 0; the power of the next term is larger by one.
 
     Returns:
-        A function for `fit`. It can be pickled if the given ones can.
+        A function for `fit`, which can be pickled if the given functions can.
 
     Raises:
         InvalidInput: If `ratio` or `order` is not accepted; in a call, if the residuals cannot be
@@ -94,7 +94,7 @@ def extrapolated(
     a, b = -1 / (q - 1), q / (q - 1)
     weights: tuple[float, ...] = (a, b)
     if finer is not None:
-        # The errors of the next order of the two extrapolations differ by the next power.
+        # The errors left by (coarse, fine) and (fine, finer) have the ratio q * base.
         once, r = ((a, b, 0.0), (0.0, a, b)), q * base
         weights = tuple((r * y - x) / (r - 1) for x, y in zip(*once, strict=True))
     return _Extrapolated(levels, weights)

@@ -74,8 +74,8 @@ __all__ = [
 ]
 
 _TINY = 1e-300
-_SAME = 1e-6  # relative and absolute difference of residuals that are the same
-_SHOWN = 20  # numbers that a repr lists
+_SAME = 1e-6  # relative and absolute tolerance for equal residuals
+_SHOWN = 20  # most numbers listed by a repr
 _COVARIANCES = ("auto", "white", "robust")
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 
@@ -84,35 +84,35 @@ _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 class Fit:
     """The best of all starts.
 
-    Standard errors follow from J^T J at the solution, with the noise that the residuals show, and
-    from the priors. Where there are no more residuals than numbers they show none, and count as
-    what they are meant to be: in units of their noise.
+    Standard errors follow from J^T J at the solution, the noise estimated from the residuals, and
+    the priors. If there are no more residuals than numbers, the noise cannot be estimated, and the
+    residuals are assumed to be in units of their noise.
 
     Attributes:
         parameters: Parameters that hold the variables, None elsewhere.
         values: Values of all variables.
-        names: Name of each number that was fitted.
-        covariance: Of these numbers, [p, p].
-        correlation: Likewise.
+        names: Name of each fitted number.
+        covariance: Covariance of the fitted numbers, [p, p].
+        correlation: Correlation of the fitted numbers, [p, p].
         intervals: Name of each number -> its interval of 95 %.
-        unidentifiable: Directions that the observations do not tell, the worst first.
-        collinear: Numbers that would be known ten times better if another were known.
-        blocks: Name of each block of residuals -> their size beside their noise.
+        unidentifiable: Directions that the observations do not determine, the worst first.
+        collinear: Numbers whose error would be ten times smaller if the others were known.
+        blocks: Name of each block of residuals -> its size relative to the noise.
         noise_model: Noise that the covariance assumes: "white noise", "correlated stretches" or
             "random walks".
-        residuals: At the solution [M], of the last stage, without priors.
-        cost: Half the sum of their squares and of those of the priors.
+        residuals: Residuals of the last stage at the solution [M], without priors.
+        cost: Half the sum of squares at the solution, priors included.
         success: Whether the solver converged.
-        message: How it ended.
+        message: Reason of the end.
         at_bounds: Names of the numbers that ended at a bound, where intervals mean little.
-        starts: Where each start ended, and why not at the best place.
+        starts: First values and end of each start, and why it missed the best minimum.
         held_out: Root mean square of the residuals of each trajectory that was kept out of the fit:
             about one if the model is right and the noise is known; one infinite number if the
             simulation fails there.
         history: All evaluations, start after start.
-        compared: The residuals of the last stage, and those kept out, for the report.
+        compared: Residual functions of the last stage and of `hold_out`, for the report.
         linearized: Residuals of the last stage to first order in the fitted numbers.
-        solved: What the fit follows from, as `save` writes it.
+        solved: Ends of all starts with the options of the fit, the content of `save`.
     """
 
     parameters: Parameters
@@ -146,7 +146,7 @@ class Fit:
         return "\n".join(lines)
 
     def lines(self) -> list[str]:
-        """Describe each number in a sentence: its value and interval, or that it is not known."""
+        """Describe each number in a sentence: its value and interval, or that it is unknown."""
         numbers = self.linearized.space.from_theta(self.linearized.theta)
         return [
             f"{name} {number:.6g}, {self._interval_text(name)}"
@@ -178,7 +178,7 @@ class Fit:
 
         Raises:
             InvalidInput: If a tie is a function.
-            OSError: If it cannot be written.
+            OSError: If the file cannot be written.
         """
         write_fit(as_path("Fit.save: `path`", path), self.solved)
 
@@ -190,17 +190,17 @@ class Fit:
 
         Args:
             path: The file.
-            residuals: The residuals of the last stage, which files do not hold. Without them
-                `profile`, `report` and more than one evaluation of `step_bias` and `mesh_bias` are
-                refused. They are evaluated once, and compared with those of the fit.
+            residuals: Residual function of the last stage, which a file cannot hold. It is
+                evaluated once and compared with the residuals of the fit. Without it, `profile`,
+                `report` and more than one evaluation of `step_bias` and `mesh_bias` are refused.
             hold_out: Residuals that were kept out, for `report`; needs `residuals`.
 
         Returns:
-            The fit. A profile of it is solved by "least_squares" where the fit was by torch.
+            The fit. If an optimizer of torch solved it, `profile` uses "least_squares" instead.
 
         Raises:
-            InvalidInput: If the file holds no fit, or `residuals` differ from those of the fit.
-            OSError: If it cannot be read.
+            InvalidInput: If the file holds no fit, or `residuals` differ from the fit's residuals.
+            OSError: If the file cannot be read.
             SimulationError: If the simulation of `residuals` fails.
         """
         owner = "Fit.load"
@@ -219,7 +219,7 @@ class Fit:
         return found
 
     def _functions(self, owner: str) -> list[Residuals]:
-        """The residuals, of which a fit from a file has none."""
+        """Return the residual functions; a fit that was loaded without `residuals` has none."""
         if not self.compared:
             raise InvalidInput(
                 f"{owner}: a fit from a file has no residuals: give them to Fit.load(path, "
@@ -243,11 +243,11 @@ class Fit:
         return sum(bool(trial.failure) for trial in self.history)
 
     def profile(self, name: str) -> Profile:
-        """Find the interval of a number from the cost itself, where a linear model is too rough.
+        """Find the interval of a number from the cost itself, if a linear model is too rough.
 
         At values to both sides, up to six half widths away, the other numbers are fitted again,
         until the cost has risen by as much as a quadratic cost rises at the ends of the interval.
-        This costs a fit at each value, about six in all.
+        Each value costs a fit, about six in all.
 
         Args:
             name: One of `names`.
@@ -269,12 +269,12 @@ class Fit:
         """Evaluate a quantity at the fitted numbers, with a band of 95 % to first order.
 
         Args:
-            function: Of the same arguments as `residuals`; returns a tensor, as the positions of a
-                motion that nobody recorded.
+            function: Function of the arguments of `residuals` that returns a tensor, such as the
+                positions of a motion that was not recorded.
 
         Raises:
             InvalidInput: If the observations leave a number unknown.
-            TypeError: If `function` is none, or returns something else than a tensor.
+            TypeError: If `function` is not a function, or does not return a tensor.
             SimulationError: If the simulation fails.
         """
         if not callable(function):
@@ -284,18 +284,20 @@ class Fit:
         return predict(self.linearized, function)
 
     def information(self, candidate: Residuals) -> dict[str, float]:
-        """Expect the half widths of the intervals if a recording were added: which one is next?
+        """Compute the expected half widths of the intervals if a recording were added.
+
+        The result shows which recording to make next.
 
         Args:
-            candidate: Residuals of the recording, as those of `fit`, in units of its noise. Their
-                values do not matter: compare with anything of the right shape.
+            candidate: Residuals of the recording in units of its noise, as for `fit`. Only their
+                derivatives matter: compare with any observations of the right shape.
 
         Returns:
             Name of each number -> expected half width, in the unit of the number.
 
         Raises:
             InvalidInput: If a number would still be unknown.
-            TypeError: If `candidate` is no function.
+            TypeError: If `candidate` is not a function.
             SimulationError: If the simulation fails.
         """
         if not callable(candidate):
@@ -315,21 +317,23 @@ class Fit:
         """Estimate how far the time step h shifts the fitted numbers.
 
         With residuals r of the fit and f of the time step h / ratio, residuals in the limit h = 0
-        are r + (f - r) q / (q - 1) to the leading order in h, with q = ratio^order. The least
-        squares of these lie -(J^T J + P^2)^-1 J^T (f - r) q / (q - 1) from the solution, with the
-        Jacobian J and the precisions P of the priors. Where this step is not small beside the
-        intervals, both residuals are evaluated again behind it, with the same Jacobian. See
-        `residuals.extrapolated` for the motions to which this applies.
+        are r + (f - r) q / (q - 1) to the leading order in h, with q = ratio^order. Their
+        least-squares solution differs from the solution of the fit by the step
+        -(J^T J + P^2)^-1 J^T (f - r) q / (q - 1), with the Jacobian J and the precisions P of the
+        priors. If the step is not small relative to the intervals, both residuals are evaluated at
+        its end and the next step is made with the same Jacobian. See `residuals.extrapolated` for
+        the motions to which this applies.
 
         Args:
-            finer: The residuals of the last stage, from a simulation with the time step h / ratio.
+            finer: Residuals of the last stage, from a simulation with the time step h / ratio.
             ratio: Ratio of the two time steps, > 1.
             order: Power of h in the error of positions, > 0: 1 with implicit Euler, 2 with
                 `integrator="second_order"`.
-            max_evaluations: Of `finer`, >= 1; one suffices where the bias is small.
+            max_evaluations: Largest number of evaluations of `finer`, >= 1; one suffices if the
+                bias is small.
 
         Returns:
-            Name of each free variable -> limit minus value, so that value plus shift is the fit of
+            Name of each free variable -> limit minus value: value plus shift is the fit of
             extrapolated residuals. Numbers at a bound do not move.
 
         Raises:
@@ -354,12 +358,12 @@ class Fit:
         """Estimate how far the mesh shifts the fitted numbers, as `step_bias`.
 
         Args:
-            finer: The residuals of the last stage, from a mesh whose edges are shorter by `ratio`;
+            finer: Residuals of the last stage, from a mesh whose edges are shorter by `ratio`;
                 its markers are the same material points in the same order.
             ratio: Ratio of the edge lengths, > 1.
-            order: Power of the edge length in the error of positions, > 0: about 2 where the cloth
-                is resolved; 1 where a boundary moves with the mesh, as beside a clamp.
-            max_evaluations: As that of `step_bias`.
+            order: Power of the edge length in the error of positions, > 0: about 2 if the cloth is
+                resolved; 1 if a boundary moves with the mesh, as beside a clamp.
+            max_evaluations: As in `step_bias`.
 
         Returns:
             Name of each free variable -> limit minus value.
@@ -409,18 +413,18 @@ class Fit:
         return {name: values[name] - self.values[name] for name in model.space.variables}
 
     def report(self, path: str | Path) -> None:
-        """Write a page that shows the fit: one file, which loads nothing.
+        """Write a page about the fit: one file, which loads nothing.
 
-        It has the values with their intervals, the correlation, the residuals over time, the worst
-        marker, the first and the last values beside what was observed, and the starts. For this,
-        the residuals are evaluated at the last values, and at the first ones of the first start
-        that could be simulated.
+        The page has the values with their intervals, the correlation, the residuals over time, the
+        worst marker, the first and last motions beside the observations, and the starts. The
+        residuals are evaluated at the last values, and at the first values of the first start that
+        could be simulated.
 
         Args:
-            path: File that ends in ".html".
+            path: File name that ends in ".html".
 
         Raises:
-            InvalidInput: If it ends otherwise.
+            InvalidInput: If `path` has another ending.
             SimulationError: If the simulation fails.
         """
         file = as_path("Fit.report: `path`", path)
@@ -474,58 +478,58 @@ def fit(
     >>> fit.values["stretch"], fit.intervals["stretch"]
 
     Args:
-        variables: Name -> variable, or a `Tie` to another one. Names of fields of `Parameters`
-            become that; others reach `residuals` as a second argument.
+        variables: Name -> variable, or a `Tie` to another variable. Variables named like a field of
+            `Parameters` become that field; all others reach `residuals` as a second argument.
         residuals: Function of a `Parameters` that holds the variables, and of name -> value of the
-            other variables if there are some; returns a tensor, or a list of tensors, one for
-            each trajectory, or a dict of name -> tensor: see `dc.residuals`. It is called with
+            other variables if there are any. It returns a tensor, a list of tensors, one for each
+            trajectory, or a dict of name -> tensor: see `dc.residuals`. The function is called with
             tensors that are being differentiated, and must return the same values for the same
-            input. Or a list of `Stage`, run one after the other; the last one must free all
+            input. Or a list of `Stage`, run one after the other; the last stage must free all
             variables.
         method: The solver. "least_squares" is SciPy's trust region, with Jacobians. "L-BFGS-B" is
             SciPy's, with gradients, for many variables. A function that makes an optimizer of
             torch, as `partial(torch.optim.Adam, lr=0.05)`, takes `max_evaluations` steps of
             `dc.descend`.
         starts: Number of starts: the first values, then random ones, see `Variable`.
-        seed: Of the random starts.
-        loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them;
-            "linear" for other methods than "least_squares".
-        loss_scale: Residual from which on the others count less, > 0.
-        max_evaluations: Of the residuals, for each stage of each start.
+        seed: Seed of the random starts.
+        loss: Loss of the squared residuals: "linear", "soft_l1", "huber", "cauchy" or "arctan", as
+            in SciPy; methods other than "least_squares" accept "linear" only.
+        loss_scale: Residual above which a robust loss reduces the weight, > 0.
+        max_evaluations: Largest number of evaluations of the residuals in a stage of a start.
         tolerance: Relative change of the cost or the variables at which a stage ends.
-        covariance: Noise that the intervals assume. "white" takes residuals as independent of each
-            other. "robust" accounts for correlation along series, which are the first axis of each
-            tensor, or the markers of `residuals.markers`: from stretches of the series, and where
-            these are short beside the correlation, as a random walk. "auto" takes "robust" where
+        covariance: Noise that the intervals assume. "white" assumes independent residuals. "robust"
+            accounts for correlation along series, which are the first axis of each tensor, or the
+            markers of `residuals.markers`. It uses stretches of the series; if the series are short
+            relative to the correlation time, it assumes random walks. "auto" uses "robust" if
             residuals are correlated, and warns.
-        priors: What is known beforehand of several variables together.
+        priors: Joint priors of several variables.
         hold_out: Residuals of trajectories that are kept out of the fit, as `residuals`.
         workers: Number of processes for the starts, 0 for none, or an executor of processes. The
             result has the same bits for any number. `residuals` must then be a function of a module
             or another object that can be pickled, and a script needs
             `if __name__ == "__main__":`.
         deadline: Longest time of an evaluation and its Jacobian in a process of `workers` [s]. A
-            process that takes longer, or dies, is replaced, and its start computed again, up to
+            process that exceeds it, or dies, is replaced, and its start is computed again, up to
             three times. An executor has no deadline.
-        resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
-            and ends with the same bits. Residuals that differ where they began are refused, and
-            so is a folder that another process uses.
-        progress: Called after each evaluation; of starts in processes, when they have ended.
+        resume: Folder that stores all evaluations. An interrupted fit reads them, and ends with the
+            same bits as without the interruption. Residuals whose values at the first point have
+            changed are refused, and so is a folder in use by another process.
+        progress: Called after each evaluation; for starts in processes, after the start has ended.
 
     Returns:
-        The best fit, with its uncertainty. A trial step in which the simulation fails, or whose
-        numbers belong to no material together, is rejected, and counted.
+        The best fit, with its uncertainty. A trial step is rejected and counted if the simulation
+        fails, or if its numbers together belong to no material.
 
     Raises:
         InvalidInput: If an argument is not accepted.
         SimulationError: If the simulation fails at the first values of every start.
-        TypeError: If `residuals` returns something else.
-        WorkerError: If the processes of a start die, or miss the deadline, again and again.
+        TypeError: If `residuals` returns a value of another type.
+        WorkerError: If the processes of a start die, or exceed the deadline, repeatedly.
 
     Warns:
         ModelErrorWarning: If residuals are too large for their noise.
-        NoiseWarning: If they are too small for it.
-        CorrelatedResidualsWarning: If they are correlated, and the covariance accounts for it.
+        NoiseWarning: If residuals are too small for their noise.
+        CorrelatedResidualsWarning: If residuals are correlated, and the covariance accounts for it.
     """
     from_extra("scipy", "fit", "fit: it needs SciPy")
     check_choice("fit: `covariance`", covariance, _COVARIANCES)
@@ -559,7 +563,7 @@ def fit(
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
     assert best.layout is not None  # it has residuals
-    # Where a solver has stopped early, residuals show the way that is left, and no noise.
+    # If a solver stopped early, residuals show the remaining distance and not the noise.
     correlated = best.success and are_correlated(best.residuals, best.layout)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     solved = Solved(
@@ -582,7 +586,7 @@ def _best(ends: Sequence[End]) -> End:
 
 
 def _assemble(solved: Solved, compared: list[Residuals]) -> Fit:
-    """What follows from the ends of all starts."""
+    """Compute the fit from the ends of all starts."""
     space, options, best = solved.space, solved.options, _best(solved.ends)
     noise = noise_of(best.residuals, len(space), options.loss, options.loss_scale)
     assert best.layout is not None  # it has residuals
@@ -630,7 +634,7 @@ def _assemble(solved: Solved, compared: list[Residuals]) -> Fit:
 
 
 def _check_same(owner: str, residuals: Residuals, found: Fit) -> None:
-    """Refuse residuals that are not those of a fit."""
+    """Refuse residuals that differ from the residuals of the fit."""
     _check_signature(residuals, found.solved.space)
     with torch.no_grad():
         parts = trajectories(residuals, found.values)
@@ -644,7 +648,7 @@ def _check_same(owner: str, residuals: Residuals, found: Fit) -> None:
 
 
 def _influence(residuals: FloatArray, loss: str, scale: float) -> FloatArray:
-    """Residuals as they act on the fit: themselves, unless the loss is robust."""
+    """Influence of each residual on the fit: the residual itself unless the loss is robust."""
     weights, slopes = weights_of(residuals, loss, scale)
     influence: FloatArray = weights * residuals / max(float(slopes.mean()), _TINY)
     return influence
@@ -653,7 +657,7 @@ def _influence(residuals: FloatArray, loss: str, scale: float) -> FloatArray:
 def _robust(
     influence: FloatArray, layout: Layout, noise: Noise, numbers: int
 ) -> tuple[str, Spread, Noise]:
-    """Covariance of correlated residuals: its name, its spread, and the freedom of its noise."""
+    """Noise model of correlated residuals: name, spread, and noise with its degrees of freedom."""
     if is_walk(influence, layout, numbers):
         return "random walks", lambda u: walk(influence, layout, u), noise
     spread, count = stretches(influence, layout, numbers)
@@ -719,11 +723,11 @@ def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]
 
 
 def _check_signature(residuals: Residuals, space: Space) -> None:
-    """Refuse a misspelled parameter, which would reach a function that does not take it."""
+    """Refuse a misspelled parameter: the residual function has no argument for it."""
     others = [name for name in space.all_variables if name not in PARAMETERS]
     try:
         signature = inspect.signature(residuals)
-    except (TypeError, ValueError):  # of some built-in functions nobody knows it
+    except (TypeError, ValueError):  # unknown for some built-in functions
         return
     arguments = ["parameters", "values"] if others else ["parameters"]
     try:
@@ -764,7 +768,7 @@ def _errors(residuals: Residuals, values: Mapping[str, Tensor]) -> list[float]:
 
 
 def _warn_of_bounds(space: Space, at_bounds: Sequence[str]) -> None:
-    """Warn of numbers that ended at a bound which nobody gave."""
+    """Warn of numbers that ended at a default bound."""
     for name in space.default_bounds:
         here = [n for n in at_bounds if n.partition("[")[0] == name]
         if here:

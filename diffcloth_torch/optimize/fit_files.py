@@ -1,4 +1,4 @@
-"""Fits in files: what they found, without the functions that made them."""
+"""Files of fits: their results, without the functions of the residuals."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from diffcloth_torch.optimize.variables import Prior, Space, Tie, Variable
 
 __all__ = ["Solved", "read_fit", "write_fit"]
 
-_KIND = "fit result"  # of the files
+_KIND = "fit result"  # kind of the files
 _PARTS = ("variables", "priors", "options", "ends", "robust", "held_out")
-_ROWS = ("block", "series", "time")  # of a layout
+_ROWS = ("block", "series", "time")  # arrays of a layout
 
 
 class Solved(NamedTuple):
-    """What a fit follows from.
+    """Data from which a fit is assembled.
 
     Attributes:
-        space: What was searched.
-        options: How it was solved.
+        space: The searched space.
+        options: Options of the solver.
         ends: End of each start.
         robust: Whether the covariance accounts for correlated residuals.
         held_out: Root mean square of the residuals of each trajectory that was kept out.
@@ -52,7 +52,7 @@ class Solved(NamedTuple):
     held_out: list[float]
 
     def without_functions(self) -> Solved:
-        """The same with the solver "least_squares" in the place of an optimizer of torch."""
+        """Return a copy with "least_squares" in place of an optimizer of torch."""
         if isinstance(self.options.method, str):
             return self
         return self._replace(options=replace(self.options, method=METHODS[0]))
@@ -84,11 +84,11 @@ def write_fit(path: Path, solved: Solved) -> None:
 
 
 def read_fit(owner: str, path: Path) -> Solved:
-    """Read such a file.
+    """Read a file of `write_fit`.
 
     Raises:
-        InvalidInput: If it has no fit.
-        OSError: If it cannot be read.
+        InvalidInput: If the file holds no fit.
+        OSError: If the file cannot be read.
     """
     content = read_checkpoint(owner, path, _KIND)
     with refusing_damage(owner, path):

@@ -1,4 +1,4 @@
-"""The page of a fit: one file with its pictures inside."""
+"""The page of a fit: one HTML file with embedded pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from diffcloth_torch.optimize.starts import Start
 __all__ = ["Page", "write_page"]
 
 _OBSERVED, _FIRST, _LAST = "#444444", "#c8553d", "#2a6f97"
-_FRAMES = 4  # moments that are shown of each trajectory
+_FRAMES = 4  # moments shown for each trajectory
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em;
        color: #222; }
@@ -38,7 +38,7 @@ td.text { text-align: left; } img { max-width: 100%; }
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """What the page shows; the fields are those of `Fit`, with `intervals` as sentences."""
+    """Content of the page: fields of `Fit`, with `intervals` as sentences."""
 
     names: list[str]
     values: Mapping[str, Tensor]
@@ -97,7 +97,7 @@ def write_page(path: Path, page: Page) -> None:
 
 
 def _compare(page: Page, values: Mapping[str, Tensor]) -> list[tuple[str, Comparison]]:
-    """Titles and comparisons: of what was fitted, then of what was kept out."""
+    """Titles and comparisons: fitted trajectories first, then trajectories kept out."""
     found = []
     for kind, residuals in zip(("Fitted", "Kept out of the fit"), page.residuals, strict=False):
         with torch.no_grad(), noting() as notes:
@@ -184,7 +184,7 @@ def _trajectory(title: str, first: Comparison, last: Comparison) -> list[str]:
 
 
 def _distances(compared: Comparison) -> FloatArray:
-    """Distance of each point to what was observed [m], shape [T, n]; NaN where it was not."""
+    """Distance of each point to its observation [m], shape [T, n]; NaN for unseen points."""
     found = np.full((len(compared.times), len(compared.labels)), np.nan)
     pairs = zip(compared.simulated, compared.observed, strict=True)
     for k, (simulated, observed) in enumerate(pairs):
@@ -193,17 +193,17 @@ def _distances(compared: Comparison) -> FloatArray:
 
 
 def _coordinates(compared: Comparison) -> int:
-    """Coordinates of a point that have noise: an outline has it along its rays alone."""
+    """Number of noisy coordinates of a point: outlines have noise along their rays only."""
     return 1 if compared.kind == "outline" else 3
 
 
 def _expected(compared: Comparison) -> float:
-    """Root mean square that noise alone makes of a distance [m]."""
+    """Root mean square of a distance that is due to noise alone [m]."""
     return compared.noise * float(np.sqrt(_coordinates(compared)))
 
 
 def _noise_band(compared: Comparison) -> FloatArray:
-    """Root mean square distance of each frame within which noise alone is in 95 %, [2, T]."""
+    """Interval of 95 % of the root mean square distance of each frame by noise alone, [2, T]."""
     from scipy.stats import chi2
 
     counts = (~np.isnan(_distances(compared))).sum(axis=1) * _coordinates(compared)
@@ -249,7 +249,7 @@ def _frames(figure: Any, first: Comparison, last: Comparison) -> None:
 
 
 def _plane(compared: Comparison) -> tuple[int, int]:
-    """The two coordinates that vary most: the view that shows most."""
+    """Indices of the two coordinates that vary most, for the view of the frames."""
     points = np.concatenate(compared.observed)
     order = np.argsort(np.nanmax(points, axis=0) - np.nanmin(points, axis=0), kind="stable")
     low, high = sorted(int(i) for i in order[-2:])

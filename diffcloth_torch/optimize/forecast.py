@@ -1,4 +1,4 @@
-"""After a fit: predictions with bands, and the value of a recording that is not made yet."""
+"""After a fit: predictions with bands, and the expected information of a new recording."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Prediction:
 
     Attributes:
         value: The quantity, of any shape.
-        half_width: Half width of its interval of 95 %, likewise: of the fitted numbers alone, not
-            of noise.
+        half_width: Half width of the interval of 95 %, in the shape of `value`. It includes the
+            uncertainty of the fitted numbers and no noise of observations.
     """
 
     value: Tensor
@@ -41,11 +41,11 @@ class Prediction:
 
 
 def predict(model: Linearized, function: Residuals) -> Prediction:
-    """Evaluate a function of the variables, and its spread sqrt(G C G^T) to first order.
+    """Evaluate a function of the variables and its deviation sqrt(diag(G C G^T)) to first order.
 
     Args:
         model: Linear model of a fit, with the covariance C of theta.
-        function: From parameters, and name -> value of other variables, to a tensor.
+        function: Function from parameters, and name -> value of other variables, to a tensor.
     """
 
     def at(theta: Tensor) -> Tensor:
@@ -66,11 +66,11 @@ def predict(model: Linearized, function: Residuals) -> Prediction:
 def expected_half_widths(model: Linearized, candidate: Residuals) -> dict[str, float]:
     """Half width of each number if a recording were added, from its Jacobian K alone.
 
-    The covariance becomes (C^-1 + K^T K)^-1, whatever the recording will show.
+    The covariance becomes (C^-1 + K^T K)^-1, independently of the recorded values.
 
     Args:
         model: Linear model of a fit, with the covariance C of theta.
-        candidate: Residuals of the recording in units of its noise; their values do not matter.
+        candidate: Residuals of the recording in units of its noise; only derivatives matter.
     """
     space = model.space
     problem = Problem(

@@ -1,4 +1,4 @@
-"""The linear model of a fit around its solution: how its numbers follow a change of residuals."""
+"""Linear model of a fit around its solution: response of its numbers to changed residuals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from diffcloth_torch.optimize.variables import Space
 
 __all__ = ["Linearized"]
 
-_UNTOLD = 1e3  # factor, or sizes, to both sides of a number of which nothing is known
-_SINGULAR = 1e-12  # singular values below this share of the largest belong to no known direction
+_UNTOLD = 1e3  # half width (factor, or sizes) from which a number counts as unknown
+_SINGULAR = 1e-12  # relative singular value below which a direction counts as unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +23,12 @@ class Linearized:
     Attributes:
         space: Space of theta.
         theta: The solution [p].
-        residuals: There, without those of priors [M].
-        jacobian: Their derivative by theta [M, p].
+        residuals: Residuals at the solution, without residuals of priors [M].
+        jacobian: Derivative of the residuals with respect to theta [M, p].
         weights: Weight of each residual in the cost [M]: one unless the loss is robust.
         half_widths: Half widths of the intervals of theta [p].
         covariance: Covariance of theta [p, p].
-        precision_root: Rows R with R^T R the inverse of this covariance.
+        precision_root: Matrix R whose R^T R is the inverse of the covariance.
         reach: Half width of an interval of 95 % in standard errors.
     """
 
@@ -43,9 +43,9 @@ class Linearized:
     reach: float
 
     def step(self, at: FloatArray, residuals: FloatArray) -> FloatArray:
-        """Step [p] from `at` towards the least squares of other residuals, with this Jacobian.
+        """Gauss-Newton step [p] from `at` for other residuals, with the Jacobian of this model.
 
-        The gradient that is left at the solution, where a fit has not converged, is not followed.
+        If the fit has not converged, the remaining gradient at the solution is ignored.
         Numbers at a bound of the solution stay there, and no step leaves the bounds.
         """
         space, free = self.space, ~self.held
@@ -60,7 +60,7 @@ class Linearized:
 
     @property
     def untold(self) -> list[str]:
-        """Names of the numbers of which nothing is known: half widths of a thousand sizes."""
+        """Names of unknown numbers: half width at least a factor of 1000 ("log") or 1000 sizes."""
         sizes = self.half_widths / self.space.units(self.theta)
         limits = self.space.reach(_UNTOLD)
         return [name for name, far in zip(self.space.names, ~(sizes < limits), strict=True) if far]

@@ -21,19 +21,19 @@ METHODS = ("least_squares", "L-BFGS-B")
 _TINY = 1e-300
 
 Method = str | Callable[[list[Tensor]], torch.optim.Optimizer]
-"""A solver of SciPy by its name, or what makes an optimizer of torch."""
+"""Name of a solver of SciPy, or a function that makes an optimizer of torch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """How a stage is solved.
+    """Options of the solver of a stage.
 
     Attributes:
         method: The solver.
-        loss: Of the squares, of "least_squares" alone.
-        loss_scale: Residual from which on the others count less.
-        max_evaluations: Of the residuals.
-        tolerance: Relative change of the cost or the variables at which it ends.
+        loss: Loss of the squared residuals, for "least_squares" only.
+        loss_scale: Residual above which a robust loss reduces the weight.
+        max_evaluations: Largest number of evaluations of the residuals.
+        tolerance: Relative change of the cost or the variables at which the solver ends.
     """
 
     method: Method
@@ -43,22 +43,22 @@ class Options:
     tolerance: float
 
     def described(self) -> list[Any]:
-        """What evaluations belong to, in types that `torch.load` reads."""
+        """Return an identification of saved evaluations, in types that `torch.load` reads."""
         method = self.method if isinstance(self.method, str) else "torch"
         return [method, self.loss, self.loss_scale, self.max_evaluations, self.tolerance]
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a solver ended.
+    """End point of a solver.
 
     Attributes:
-        theta: The part of theta that is free.
-        cost: There.
-        residuals: There, those of priors last.
-        jacobian: There.
-        success: Whether it converged.
-        message: How it ended.
+        theta: The free part of theta.
+        cost: Cost at theta.
+        residuals: Residuals at theta; residuals of priors are last.
+        jacobian: Jacobian at theta.
+        success: Whether the solver converged.
+        message: Reason of the end.
     """
 
     theta: FloatArray
@@ -113,7 +113,7 @@ def _least_squares(
         theta=end.x,
         cost=float(end.cost),
         residuals=end.fun,
-        jacobian=problem.jacobian(end.x),  # that of SciPy has the weights of the loss
+        jacobian=problem.jacobian(end.x),  # end.jac is scaled by the weights of the loss
         success=bool(end.success),
         message=str(end.message),
     )
@@ -131,8 +131,8 @@ def _l_bfgs_b(
         nonlocal best, theta, highest
         found = problem.cost_and_gradient(at)
         if found is None:
-            # Its line search interpolates costs, and takes none that is infinite: a slope that
-            # rises from the best point, above all costs so far, sends it back.
+            # The line search interpolates costs and accepts no infinite cost. A failed trial
+            # therefore reports a slope that rises from the best point, above all costs so far.
             away = at - theta
             wall = 2 * highest + 1.0
             return wall, wall * away / max(float(away @ away), _TINY)
@@ -177,7 +177,7 @@ def _by_torch(
         costs.append(cost)
         if cost < best[0]:
             best = cost, at
-        # A function with this value and gradient: both may come from an earlier run.
+        # A surrogate with this value and gradient, since both may come from an earlier run.
         return cost + (torch.from_numpy(gradient) * (inside - inside.detach())).sum()
 
     end = ""

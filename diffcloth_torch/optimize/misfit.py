@@ -1,4 +1,4 @@
-"""Sizes of residuals beside their noise, by block, and what they mean for the intervals."""
+"""Sizes of residuals relative to their noise, by block, and the resulting warnings."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ __all__ = ["Block", "are_correlated", "blocks_of_fit", "warn_of_blocks"]
 _RARE = 1e-3  # probability below which noise alone does not explain the residuals
 _NOT_IN_UNITS = 1e-2  # root mean square below which residuals are not in units of their noise
 _NOISELESS = 1e-5  # root mean square below which residuals are rounding and tolerances
-_CHANCE = 5e-3  # probability that white noise is taken as correlated, about
+_CHANCE = 5e-3  # approximate probability that white noise is classified as correlated
 
 
 @dataclass(frozen=True)
 class Block:
-    """Residuals of one block beside their noise.
+    """Residuals of one block relative to their noise.
 
     Attributes:
         count: Number of residuals.
         rms: Root mean square, about one if the model is right and the noise is known.
         chi2: Sum of squares.
-        freedom: Its expected value: the count less the numbers that the block determines.
-        p_value: Probability that noise alone makes the sum as large; NaN where residuals are too
-            few, where the loss is robust, and below a root mean square of 0.01, at which no noise
-            was given.
+        freedom: Expected value of `chi2`: the count minus the numbers that the block determines.
+        p_value: Probability that noise alone makes the sum at least as large. NaN if residuals are
+            too few, if the loss is robust, and below a root mean square of 0.01, where the
+            residuals are not in units of their noise.
         autocorrelation: Correlation from one moment of a series to the next.
     """
 
@@ -53,8 +53,8 @@ def blocks_of_fit(
     """Describe each block.
 
     Args:
-        residuals: At the solution [M].
-        layout: Their blocks and series.
+        residuals: Residuals at the solution [M].
+        layout: Blocks and series of the residuals.
         leverage: Share of each residual that the fitted numbers absorb [M].
         loss: The loss of the fit.
     """
@@ -80,7 +80,7 @@ def blocks_of_fit(
 
 
 def are_correlated(residuals: FloatArray, layout: Layout) -> bool:
-    """Whether residuals along the series of any block are correlated, beyond chance."""
+    """Return whether residuals along the series of any block are correlated beyond chance."""
     from scipy.stats import norm
 
     if not len(residuals) or np.sqrt(np.square(residuals).mean()) < _NOISELESS:

@@ -1,4 +1,4 @@
-"""Residuals as functions of the numbers that a solver searches, and what was asked of them."""
+"""Residuals as functions of the vector that a solver searches, with a store of evaluations."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ Residuals = Callable[..., Tensor | Sequence[Tensor] | Mapping[str, Tensor]]
 
 Failure = SimulationError | InadmissibleMaterial
 FAILURES = (SimulationError, InadmissibleMaterial)
-"""What ends a trial step and not the fit: bounds do not keep out numbers that belong to no material
-together, though each is in its range."""
+"""Errors that reject a trial step and do not end the fit. Bounds apply to each number separately,
+and do not exclude combinations that belong to no material."""
 
-# Parts of what torch says of `.numpy()` where a tensor is being differentiated.
+# Parts of the messages of torch for `.numpy()` of a tensor that is being differentiated.
 _NO_NUMBERS = ("call numpy() on Tensor", "access data pointer of Tensor")
 _NO_DERIVATIVE = (
     "as it is differentiated: `.numpy()`, `.detach()`, `.item()`, `float()` and `torch.tensor()` "
@@ -65,12 +65,12 @@ class Trial:
     """One evaluation of the residuals.
 
     Attributes:
-        start: Index of the start that it belongs to.
+        start: Index of the start.
         stage: Index of the stage.
         cost: Half the sum of squares; infinite if the simulation failed.
         values: Values of all variables.
-        seconds: Time that it took [s].
-        failure: What the simulation raised, empty if nothing.
+        seconds: Wall time of the evaluation [s].
+        failure: Error of the simulation; empty if it succeeded.
     """
 
     start: int
@@ -84,17 +84,17 @@ class Trial:
 
 
 class Memory:
-    """Evaluations of one start, in a file: a fit that goes on takes them from there."""
+    """Evaluations of one start, stored in a file, from which a resumed fit reads them."""
 
     def __init__(self, file: Path | None, problem: Sequence[Any]) -> None:
-        """Read what an earlier run left.
+        """Read the evaluations of an earlier run.
 
         Args:
-            file: Where it is kept; None keeps nothing.
-            problem: What the evaluations belong to, in types that `torch.load` reads.
+            file: File of the evaluations; None stores nothing.
+            problem: Description of the problem, in types that `torch.load` reads.
 
         Raises:
-            InvalidInput: If the file belongs to another problem, or is none.
+            InvalidInput: If the file belongs to another problem, or holds no evaluations.
         """
         self._file, self._problem = file, list(problem)
         self._records: dict[tuple[str, int, bytes], dict[str, Any]] = {}
@@ -129,7 +129,7 @@ class Memory:
 
 
 class Problem:
-    """The residuals of one stage of one start, as functions of the part of theta that is free."""
+    """Residuals of one stage of one start, as functions of the free part of theta."""
 
     def __init__(
         self,
@@ -146,10 +146,10 @@ class Problem:
         """Fix all but some rows of theta.
 
         Args:
-            space: What theta stands for.
+            space: Space of theta.
             residuals: The residuals of the stage.
-            at: The whole theta where the stage begins.
-            rows: Its rows that are free.
+            at: The whole theta at the beginning of the stage.
+            rows: Free rows of theta.
             start: Index of the start.
             stage: Index of the stage.
             memory: Evaluations of the start.
@@ -166,13 +166,14 @@ class Problem:
 
     @property
     def prior_count(self) -> int:
-        """Number of the residuals, the last ones, that are those of priors."""
+        """Number of residuals of priors, which are the last ones."""
         return len(self._whitening)
 
     def require(self, theta: FloatArray) -> None:
-        """Evaluate at a start, where a failure ends it.
+        """Evaluate at the first point of a stage; a failure here ends the start.
 
-        Also where it has been kept: residuals of other observations must not go on with it.
+        A stored evaluation of this point is computed again and compared, since a fit must not be
+        resumed with other observations.
         """
         kept = self._memory.recall("residuals", self._stage, theta)
         found = self._trial(theta)
@@ -199,12 +200,12 @@ class Problem:
             )
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
+        """Residuals [M]; infinite if the simulation fails, so that the solver rejects the step."""
         found = self._trial(theta)
         return np.full(self._count, np.inf) if isinstance(found, FAILURES) else found
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Jacobian [M, p]: forward where numbers are fewer than residuals, else backward."""
+        """Jacobian [M, p]: forward mode if there are at most as many numbers as residuals."""
         record = self._memory.recall("jacobian", self._stage, theta)
         if record is None:
             few = len(self._rows) <= self._count
@@ -217,13 +218,13 @@ class Problem:
         return jacobian
 
     def failure(self, theta: FloatArray) -> Failure:
-        """What the simulation raised at a point where it fails."""
+        """Error of the simulation at a point where it fails."""
         found = self._trial(theta)
         assert isinstance(found, FAILURES)
         return found
 
     def cost_and_gradient(self, theta: FloatArray) -> tuple[float, FloatArray] | None:
-        """Half the sum of squares, and its gradient by backward [p]; None if it fails."""
+        """Half the sum of squares and its gradient [p] by backward; None on failure."""
         found = self._trial(theta)
         if isinstance(found, FAILURES):
             return None
@@ -238,7 +239,7 @@ class Problem:
         return 0.5 * float(found @ found), record["found"].numpy()
 
     def _trial(self, theta: FloatArray) -> FloatArray | Failure:
-        # The solver asks first for what the start has just been tried with.
+        # The first point of the solver has just been evaluated by `require`.
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
             self._last = key, self._evaluate(theta)
@@ -305,7 +306,7 @@ class Problem:
         return self._with_priors(list(blocks.values()), theta)
 
     def _differentiated(self, theta: Tensor, *, backward: bool) -> Tensor:
-        """The same, where a derivative is wanted; refuses residuals that have none."""
+        """Residuals with derivatives in theta; refuses residuals that have none."""
         try:
             parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
         except RuntimeError as error:
@@ -332,17 +333,17 @@ class Problem:
 
 
 def parameters_of(values: Mapping[str, Tensor]) -> Parameters:
-    """Parameters that hold the variables of their names."""
+    """Parameters from the variables named like fields of `Parameters`."""
     return Parameters(**{n: v for n, v in values.items() if n in PARAMETERS})  # type: ignore[arg-type]
 
 
 def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Tensor]:
-    """The residuals of each trajectory, at values of all variables."""
+    """Residuals of each trajectory at values of all variables."""
     return list(blocks_at(residuals, values).values())
 
 
 def blocks_at(residuals: Residuals, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same by the name of each block."""
+    """Name of each block -> its residuals at values of all variables."""
     others = {n: v for n, v in values.items() if n not in PARAMETERS}
     parameters = parameters_of(values)
     found = residuals(parameters, others) if others else residuals(parameters)
@@ -373,7 +374,7 @@ def _checked_key(record: Any) -> tuple[str, int, bytes]:
     """The key of a record of a file.
 
     Raises:
-        InvalidInput: If it is no record.
+        InvalidInput: If the argument is not a record of an evaluation.
     """
     example: dict[str, Any] = {"kind": "", "stage": 0, "theta": None, "found": None}
     if isinstance(record, dict) and record.get("kind") == "residuals":
@@ -391,7 +392,7 @@ def _checked_key(record: Any) -> tuple[str, int, bytes]:
 
 
 def _check_sizes(records: Mapping[tuple[str, int, bytes], Mapping[str, Any]]) -> None:
-    """Require one number of residuals, and of free numbers, in each stage."""
+    """Require equal counts of residuals and of free numbers in all records of a stage."""
     counts: dict[tuple[str, int], int] = {}
     for (kind, stage, _), record in records.items():
         sizes = {"free": len(record["theta"])}

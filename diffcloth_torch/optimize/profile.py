@@ -1,4 +1,4 @@
-"""Profiles of a fit: the lowest cost at each value of one number, and the interval from it."""
+"""Profiles of a fit: lowest cost at each value of one number, and the resulting interval."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from diffcloth_torch.optimize.variables import Space
 
 __all__ = ["Profile", "profile_of"]
 
-_STEP = 0.5  # of a half width
+_STEP = 0.5  # step in half widths
 _MOST = 12  # points to each side
-_UNKNOWN_STEP = 0.5  # of theta, where the linear model knows no half width
+_UNKNOWN_STEP = 0.5  # step of theta if the linear model has no half width below 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """The lowest cost at values of one number, over all others.
+    """Lowest cost over all other numbers, at values of one number.
 
     Attributes:
-        name: The number.
-        values: Its values, increasing [K].
-        rises: Rise of the cost over the smallest one at each value, in units of the rise at the
+        name: Name of the number.
+        values: Values of the number, increasing [K].
+        rises: Rise of the cost above the smallest cost at each value, in units of the rise at the
             ends of an interval of 95 % [K].
-        interval: Values at which the rise is one; where it stays below, the last value reached if
-            that is a bound, else an infinite one (zero on the scale "log").
+        interval: Values at which the rise is one. An end whose rise stays below one is the bound if
+            the bound was reached, else infinite (zero on the scale "log").
     """
 
     name: str
@@ -43,15 +43,15 @@ class Profile:
 def profile_of(
     residuals: Residuals, options: Options, model: Linearized, cost: float, row: int
 ) -> Profile:
-    """Walk to both sides of the solution, with the other numbers fitted again at each point.
+    """Step to both sides of the solution, and fit the other numbers again at each point.
 
-    The rise is scaled so that a cost that is quadratic has the interval of the linear model.
+    The rise is scaled so that a quadratic cost has the interval of the linear model.
 
     Args:
-        residuals: Those of the last stage of the fit.
-        options: How the other numbers are fitted.
+        residuals: Residuals of the last stage of the fit.
+        options: Options of the solver for the other numbers.
         model: The linear model at the solution.
-        cost: The cost there.
+        cost: Cost at the solution.
         row: Row of theta.
     """
     space, half = model.space, float(model.half_widths[row])
@@ -105,7 +105,7 @@ def _lowest(
     others: NDArray[np.int64],
     value: float,
 ) -> tuple[FloatArray, float] | None:
-    """Theta with the lowest cost at a value of one number, and the cost; None if it fails."""
+    """Theta with the lowest cost at a value of one number, and the cost; None on failure."""
     there = _with(at, row, value)
     problem = Problem(
         space,
@@ -131,7 +131,7 @@ def _lowest(
 
 
 def _crossing(before: tuple[float, float], after: tuple[float, float]) -> float:
-    """Where the rise is one: its root is nearly linear."""
+    """Value at which the rise is one, by linear interpolation of the root of the rise."""
     low, high = (math.sqrt(max(rise, 0.0)) for _, rise in (before, after))
     return before[0] + (after[0] - before[0]) * (1.0 - low) / (high - low)
 

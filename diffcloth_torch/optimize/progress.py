@@ -10,7 +10,7 @@ __all__ = ["Progress"]
 
 
 class Progress:
-    """A progress bar and its context; shows nothing if the output is not a terminal."""
+    """A progress bar as a context manager; hidden if the output is not a terminal."""
 
     def __init__(self, iterations: int, steps: int = 1, unit: str = "iteration") -> None:
         """Count `iterations` of `steps` units each."""

@@ -1,4 +1,4 @@
-"""Residuals of a fit: what was observed against what is simulated, in units of the noise."""
+"""Residuals of a fit: simulation minus observation, in units of the noise."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def markers(
     delay: Tensor | float = 0.0,
     frame: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Positions of marked vertices less those observed, over the noise.
+    """Simulated minus observed positions of marked vertices, divided by the noise.
 
-    A camera sees the motion at times of its own, later by a delay, and in a frame of its own. Each
-    of these may be a variable of the fit:
+    A camera has its own times, a delay, and its own frame. Delay and frame may be variables of the
+    fit:
 
     >>> def residuals(parameters, values):
     ...     frame = values["rotation"], values["translation"]
@@ -67,21 +67,21 @@ def markers(
         states: T states without a batch axis, one for each observation; with `times` a trajectory
             that contains these times.
         observed: Positions [m], shape [T, m, 3]; NaN where a marker was not seen.
-        weights: Weight of each marker, >= 0, shape [m] or [T, m]; 1 by default. One of zero was
-            not seen.
+        weights: Weight of each marker, >= 0, shape [m] or [T, m]; 1 by default. A marker of weight
+            zero counts as not seen.
         vertices: Indices of the m marked vertices; None means all.
         noise: Standard deviation of an observation [m], > 0: a number; one for each axis [3], for
             each marker [m, 1] or for each frame [T, 1, 1]; or of each coordinate [T, m, 3].
-        times: Times of the observations [s], shape [T], on the clock of the camera; None where
-            each state is one observation. Positions are those of `Trajectory.at`.
+        times: Times of the observations [s], shape [T], on the clock of the camera; positions are
+            computed by `Trajectory.at`. None if each state is one observation.
         delay: Time by which the camera's clock is late [s]: the motion is compared at
             `times - delay`. Needs `times`.
-        frame: Rotation vector [rad], shape [3], and translation [m], shape [3], that bring
+        frame: Rotation vector [rad], shape [3], and translation [m], shape [3], that transform
             simulated positions into the frame of the camera: x_camera = R x + t.
 
     Returns:
-        Residuals [M] of what was seen, without unit; they have derivatives, in `delay` and `frame`
-        too.
+        Residuals [M] of the seen markers, without unit; differentiable, also in `delay` and
+        `frame`.
 
     Raises:
         InvalidInput: If a shape or value is not accepted.
@@ -131,7 +131,7 @@ def markers(
 def _seen_positions(
     owner: str, states: Sequence[State], times: ArrayLike | None, delay: Tensor | float
 ) -> tuple[Tensor, FloatArray]:
-    """Positions [T, N, 3] at the moments of a camera, and these moments [s]."""
+    """Positions [T, N, 3] at the times of a camera, and these times [s]."""
     positions = positions_of(owner, states)
     late = float_tensor(f"{owner}: `delay`", delay)
     check_shape(f"{owner}: `delay`", late.shape, [()])
@@ -148,7 +148,7 @@ def _seen_positions(
 
 
 def _in_frame(owner: str, positions: Tensor, frame: tuple[Tensor, Tensor]) -> Tensor:
-    """Positions as a camera sees them, R x + t."""
+    """Positions in the frame of a camera, R x + t."""
     given: Any = frame
     if not isinstance(given, tuple | list) or len(given) != 2:
         raise InvalidInput(f"{owner}: `frame` must be (rotation, translation)")
@@ -161,7 +161,7 @@ def _in_frame(owner: str, positions: Tensor, frame: tuple[Tensor, Tensor]) -> Te
     x, y, z = rotation.unbind()
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    # The exponential has derivatives where the rotation is none, too.
+    # The matrix exponential is differentiable at the rotation zero, too.
     turn: Tensor = torch.linalg.matrix_exp(skew)
     return positions @ turn.T + translation
 
@@ -179,19 +179,19 @@ def _noise_of_coordinates(owner: str, noise: ArrayLike, shape: tuple[int, ...]) 
 def point_cloud(
     states: Sequence[State], clouds: Sequence[ArrayLike], *, noise: float = 1.0
 ) -> Tensor:
-    """Each observed point less the vertex of the cloths that is nearest to it, over the noise.
+    """Nearest vertex of the cloths minus observed point, for each point, divided by the noise.
 
-    One-sided, from what was seen to what is simulated: parts that no camera saw do not count. Which
-    vertex is nearest is held fixed by derivatives.
+    Each observed point has residuals; parts of the cloth that no camera saw do not count.
+    Derivatives keep the choice of the nearest vertex fixed.
 
     Args:
         states: T states without a batch axis, one for each cloud.
-        clouds: Of each state the points [m], shape [n, 3], none of them NaN; n = 0 where the camera
+        clouds: Observed points for each state [m], shape [n, 3], without NaN; n = 0 if the camera
             saw nothing.
         noise: Standard deviation of a point [m], > 0.
 
     Returns:
-        Residuals [M] without unit, three for each point; they have derivatives.
+        Differentiable residuals [M] without unit, three for each point.
 
     Raises:
         InvalidInput: If a shape or value is not accepted.

@@ -1,4 +1,4 @@
-"""Variables with one row per environment, which fails and restarts on its own."""
+"""Variables with one row per environment; each environment fails and restarts independently."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _TINY = 1e-6  # as in torch.nn.utils.clip_grad_norm_
 
 
 class Rows:
-    """Rows with the smallest loss of each environment, and the handling of those that failed.
+    """Rows with the smallest loss of each environment, and the handling of failed environments.
 
     Attributes:
         best: Name of a variable -> rows with the smallest loss of each environment.
-        losses: These losses, shape [B]; infinite for environments without one.
+        losses: Smallest losses, shape [B]; infinite for environments without a loss.
         risen: Environments whose loss has risen.
     """
 
     def __init__(self, variables: Variables, allowed: int) -> None:
-        """Handle these variables; `allowed` is how often in a row each environment may fail."""
+        """Handle these variables; each environment may fail `allowed` times in a row."""
         self._variables, self._allowed = variables, allowed
         rows = next(iter(variables.values())).shape[0] if variables else 0
         self.best = copies(variables)
@@ -80,7 +80,7 @@ class Rows:
             )
 
     def go_back(self, evaluation: Evaluation, optimizer: torch.optim.Optimizer) -> None:
-        """Move the rows of environments that failed half way back to their best ones."""
+        """Move the rows of failed environments halfway back to their best rows."""
         failed = evaluation.failed_environments
         for name, tensor in self._variables.items():
             with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Residuals as series over time: blocks, correlation along series, and covariances that know it."""
+"""Residuals as series over time: blocks, correlation along series, robust covariances."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from diffcloth_torch.optimize.compared import Comparison
 
 __all__ = ["Layout", "autocorrelation", "is_walk", "layout_of", "persistence", "stretches", "walk"]
 
-_UNIT_ROOT = 14.0  # correlation times in a series, below which it is near a unit root
-_LAGS = 5  # lags, at most, over which a correlation is summed
-_NOTICED = 2.0  # standard deviations of a correlation below which it has no time
-_FEWEST = 8  # pairs that show a correlation
+_UNIT_ROOT = 14.0  # correlation times below which a series is near a unit root
+_LAGS = 5  # most lags over which a correlation is summed
+_NOTICED = 2.0  # standard deviations below which a correlation is ignored
+_FEWEST = 8  # fewest pairs for a correlation
 _MOST = 0.9  # share of a direction that one stretch may determine in its prediction
 
 
@@ -50,11 +50,11 @@ class Layout:
 
 
 def layout_of(blocks: Mapping[str, Tensor], compared: Sequence[Comparison]) -> Layout:
-    """Find the series: of markers by what was seen, else along the first axis of each block.
+    """Find the series: coordinates of markers, else along the first axis of each block.
 
     Args:
         blocks: Name -> residuals; a vector is one series in its order.
-        compared: What `residuals.markers` compared while the blocks were computed.
+        compared: Comparisons noted while the blocks were computed; markers have a mask `used`.
     """
     used = [comparison.used for comparison in compared]
     matched = len(used) == len(blocks) and all(
@@ -79,7 +79,7 @@ def layout_of(blocks: Mapping[str, Tensor], compared: Sequence[Comparison]) -> L
 
 
 def autocorrelation(residuals: FloatArray, layout: Layout, lag: int = 1) -> tuple[float, int]:
-    """Correlation of moments of a series that are `lag` apart, about zero; number of pairs."""
+    """Correlation about zero of moments of a series that are `lag` apart; number of pairs."""
     early, late = layout.pairs(lag)
     a, b = residuals[early], residuals[late]
     size = 0.5 * float(a @ a + b @ b)
@@ -87,10 +87,10 @@ def autocorrelation(residuals: FloatArray, layout: Layout, lag: int = 1) -> tupl
 
 
 def persistence(residuals: FloatArray, layout: Layout) -> float:
-    """Correlation along series in standard deviations of white noise, of which it has about two.
+    """Correlation along series in its standard deviations under white noise.
 
-    The larger of the correlation at the lag one, and of the sum over several lags, which shows
-    slow changes beside much white noise.
+    The larger of the correlation at lag one and the sum over several lags; the sum detects slow
+    changes beneath much white noise.
     """
     found = [autocorrelation(residuals, layout, lag) for lag in _lags(layout)]
     if found[0][1] < _FEWEST:
@@ -104,11 +104,11 @@ def _lags(layout: Layout) -> range:
 
 
 def _decay(residuals: FloatArray, layout: Layout, numbers: int) -> float:
-    """Decay of the correlation from one moment to the next, beside white noise.
+    """Decay of the correlation from one moment to the next, with white noise added.
 
-    The ratio of the sums of autocovariances from the lag 2 and from the lag 1 on, plus the bias of
-    such estimates for a series of n moments, (1 + 3 phi) / n (Kendall, 1954), and 2 / n for each
-    number that a series has fitted.
+    The ratio phi of the sums of autocovariances from lag 2 on and from lag 1 on, plus the bias of
+    such an estimate for a series of n moments, (1 + 3 phi) / n (Kendall, 1954), and 2 / n for each
+    fitted number per series.
     """
     g = []
     for lag in [*_lags(layout), _lags(layout).stop]:
@@ -127,11 +127,11 @@ def _length(layout: Layout) -> float:
 
 
 def is_walk(residuals: FloatArray, layout: Layout, numbers: int) -> bool:
-    """Whether series are so short, beside their correlation time, that they look like walks.
+    """Return whether series are short enough, relative to their correlation time, for walks.
 
     Args:
         residuals: Residuals [M].
-        layout: Their series.
+        layout: Series of the residuals.
         numbers: Number of fitted numbers.
     """
     decay = _decay(residuals, layout, numbers)
@@ -143,9 +143,9 @@ def stretches(
 ) -> tuple[Callable[[FloatArray], FloatArray], float]:
     """Covariance C of residuals from stretches of the series, and the number of stretches.
 
-    A stretch is two correlation times long; stretches are taken as independent of each other. Each
-    one is predicted from the others, as the jackknife does, since a fit makes its own residuals
-    too small (CR3: Bell and McCaffrey, 2002).
+    A stretch is two correlation times long; stretches are assumed to be independent of each other.
+    Each stretch is predicted from all others, as in the jackknife, since a fit reduces its own
+    residuals (CR3: Bell and McCaffrey, 2002).
 
     Returns:
         U^T C U [p, p] as a function of orthonormal directions U [M, p], and the number.
@@ -173,7 +173,7 @@ def stretches(
 
 
 def walk(residuals: FloatArray, layout: Layout, directions: FloatArray) -> FloatArray:
-    """U^T C U for random walks, each beside white noise, whose variances the increments show.
+    """U^T C U for random walks plus white noise, with variances estimated from the increments.
 
     Increments of a walk with the variance w a moment, seen with white noise of the variance n,
     have the variance w + 2 n and the covariance -n from one to the next. A walk begins at zero, one

@@ -103,8 +103,8 @@ class End:
         residuals: Residuals at the end, without priors.
         jacobian: Jacobian of these residuals.
         success: Whether the solver converged in every stage.
-        message: How it ended.
-        history: Its evaluations.
+        message: Reason of the end.
+        history: Evaluations of the start.
         layout: Blocks and series of the residuals.
         failure: The error of a failure.
     """
@@ -219,7 +219,7 @@ def _work(job: Job, start: tuple[int, FloatArray]) -> End:
 
 
 def judge(space: Space, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
-    """Say of each end whether it is at the best place, and if not, why."""
+    """Describe each start; `apart` holds the reason why its end differs from the best minimum."""
     return [
         Start(
             first=space.values(torch.from_numpy(end.first.copy())),

@@ -20,7 +20,7 @@ def reports_of(states: Sequence[State]) -> list[Report]:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Replace by None what JSON cannot write: the distance of what is far apart, no known time."""
+    """Replace values that JSON cannot write by None: distance of far surfaces, unknown time."""
     return value if math.isfinite(value) else None
 
 
@@ -54,5 +54,5 @@ def rollout_statistics(states: Sequence[State]) -> dict[str, Any]:
 
 
 def _values(number: Any) -> list[Any]:
-    """List the number of one environment, or those of a batch."""
+    """List the number of one environment, or the numbers of a batch."""
     return number.flatten().tolist() if isinstance(number, torch.Tensor) else [number]

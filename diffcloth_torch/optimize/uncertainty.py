@@ -1,4 +1,4 @@
-"""How sure a fit is: covariances from the Jacobian, intervals, and what cannot be told apart."""
+"""Uncertainty of a fit: covariances from the Jacobian, intervals, and unknown directions."""
 
 from __future__ import annotations
 
@@ -23,26 +23,27 @@ __all__ = [
     "weights_of",
 ]
 
-# Standard error of a direction, in sizes of its variables, from which on it is not known at all.
+# Standard error of a direction, in sizes of its variables, from which the direction is unknown.
 _UNSURE = 1.0
-_NOTHING = 1e6  # the same, above which only its rounding is known
+_NOTHING = 1e6  # standard error of a direction from which its singular value is rounding
 _SHOWN = 0.1  # share of a direction below which a variable is not named
 _CONFIDENCE = 0.95
-_COLLINEAR = 0.1  # error if the others were known, over the error, below which a number is named
-_KNOWN = 0.01  # standard error, in sizes of a number, below which it needs no naming
-_SINGULAR = 1e-12  # singular values below this share of the largest belong to no known direction
+_COLLINEAR = 0.1  # ratio of the error with known others to the error, below which a number is named
+_KNOWN = 0.01  # standard error, in sizes of a number, below which the number is not named
+_SINGULAR = 1e-12  # relative singular value below which a direction counts as unknown
 _TINY = 1e-300
 
 Spread = Callable[[FloatArray], FloatArray]
-"""From directions U [M, p] to U^T C U [p, p], with the covariance C of the residuals."""
+"""Function from directions U [M, p] to U^T C U [p, p], with the covariance C of the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A combination of variables that the observations do not tell.
+    """A combination of variables that the observations do not determine.
 
     Attributes:
-        standard_error: Of the combination, in sizes of its variables: relative on the scale "log".
+        standard_error: Standard error of the combination, in sizes of its variables: relative on
+            the scale "log".
         shares: Name of a number -> its share in the combination, which has length one.
     """
 
@@ -59,14 +60,14 @@ class Direction:
 
 @dataclass(frozen=True)
 class Collinear:
-    """A number that the observations tell almost only together with others.
+    """A number that the observations determine almost only together with others.
 
     Attributes:
-        name: The number.
-        other: The number with which it is correlated most.
-        correlation: Their correlation.
+        name: Name of the number.
+        other: Name of the number with the largest correlation.
+        correlation: Correlation of both numbers.
         standard_error: Standard error of the number in its size: relative on the scale "log".
-        error_if_known: The same if all other numbers were known.
+        error_if_known: Standard error if all other numbers were known.
     """
 
     name: str
@@ -85,18 +86,18 @@ class Collinear:
 
 
 class Uncertainty(NamedTuple):
-    """What the Jacobian at a solution says.
+    """Uncertainty from the Jacobian at a solution.
 
     Attributes:
-        covariance: Of the numbers, [p, p].
-        correlation: Likewise.
+        covariance: Covariance of the numbers, [p, p].
+        correlation: Correlation of the numbers, [p, p].
         intervals: Name of each number -> its interval of 95 %.
-        unidentifiable: Directions that the observations do not tell, the worst first.
+        unidentifiable: Directions that the observations do not determine, the worst first.
         collinear: Numbers that are known almost only together with another.
         deviations: Standard error of each theta [p].
         half_widths: Half widths of the intervals of theta [p].
         of_theta: Covariance of theta [p, p].
-        precision_root: Rows R with R^T R the inverse of this covariance.
+        precision_root: Matrix R whose R^T R is the inverse of the covariance of theta.
         reach: Half width of an interval of 95 % in standard errors.
     """
 
@@ -116,8 +117,8 @@ class Noise(NamedTuple):
     """Standard deviation of the residuals.
 
     Attributes:
-        deviation: The deviation.
-        freedom: In how many residuals it shows; infinite where it is that which was given.
+        deviation: The standard deviation.
+        freedom: Degrees of freedom of its estimate; infinite if the given noise is assumed.
     """
 
     deviation: float
@@ -125,11 +126,11 @@ class Noise(NamedTuple):
 
 
 def noise_of(residuals: FloatArray, numbers: int, loss: str, scale: float) -> Noise:
-    """The noise that the residuals of a fit show; one where they are too few to show any.
+    """Noise estimated from the residuals of a fit; one if there are too few residuals.
 
-    With the influence psi of a residual, half the derivative of a loss by it, the numbers spread as
-    with residuals of the variance  sum psi^2 / (M - p) / (mean psi')^2:  Huber, Robust Statistics,
-    1981, chapter 7. With the loss "linear" psi is the residual.
+    Let psi be half the derivative of the loss with respect to a residual (its influence). The
+    numbers spread as with residuals of the variance  sum psi^2 / (M - p) / (mean psi')^2:  Huber,
+    Robust Statistics, 1981, chapter 7. With the loss "linear", psi is the residual.
     """
     freedom = len(residuals) - numbers
     if freedom < 1:
@@ -153,7 +154,7 @@ def leverages(space: Space, theta: FloatArray, jacobian: FloatArray) -> FloatArr
 def weights_of(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
     """Weights w of residuals r in the gradient of the cost, w r, and the derivatives of w r by r.
 
-    The losses are those of SciPy.
+    The losses are defined as in SciPy.
     """
     z = np.square(residuals / scale)
     if loss == "linear":
@@ -176,15 +177,15 @@ def uncertainty_of(
     """Standard errors at the solution, from the noise of the residuals and from the priors.
 
     With the variance s^2 of white residuals and the precisions P of the priors, the covariance is
-    (J^T J / s^2 + P^2)^-1. With residuals of another covariance C it is
-    H^-1 (J^T C J + P^2) H^-1 with H = J^T J + P^2, the spread of the least squares.
+    (J^T J / s^2 + P^2)^-1. For a general covariance C of the residuals, the covariance is
+    H^-1 (J^T C J + P^2) H^-1 with H = J^T J + P^2, the spread of the least-squares solution.
     """
     noise = found.deviation
-    # In sizes of the variables, so that directions compare.
+    # Scaled by the sizes of the variables, so that directions are comparable.
     units = space.units(theta)
     priors = space.whitening * units
     scale = noise if spread is None else 1.0
-    # With zero rows, where residuals are fewer than numbers, no direction is left out.
+    # Zero rows keep all directions if there are fewer residuals than numbers.
     rows = np.vstack([jacobian * units, priors * scale, np.zeros((len(space), len(space)))])
     left, singular, directions = np.linalg.svd(rows, full_matrices=False)
     if spread is None:
@@ -222,7 +223,7 @@ def uncertainty_of(
 
 
 def _inverse_root(middle: FloatArray) -> FloatArray:
-    """Rows R with R^T R = M^-1; huge where M is zero, as where residuals show no noise.
+    """Matrix R with R^T R = M^-1; huge where M is zero, as for residuals without noise.
 
     The covariance V S^-1 M S^-1 V^T has the inverse Q^T Q with Q = R S V^T.
     """
@@ -234,7 +235,7 @@ def _inverse_root(middle: FloatArray) -> FloatArray:
 def _collinear(
     names: list[str], correlation: FloatArray, errors: FloatArray, alone: FloatArray
 ) -> list[Collinear]:
-    """Numbers that would be known ten times better if another were known."""
+    """Numbers whose error would be ten times smaller if all others were known."""
     found = []
     for i, name in enumerate(names):
         if not (alone[i] < _COLLINEAR * errors[i] < np.inf and errors[i] > _KNOWN):
@@ -249,7 +250,7 @@ def _collinear(
 
 
 def _correlation(covariance: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Correlations; zero with a number of which nothing is known, whose variance is infinite."""
+    """Correlations; zero for unknown numbers, whose variance is infinite."""
     with np.errstate(invalid="ignore"):
         found = covariance / np.maximum(np.outer(deviations, deviations), _TINY)
     found = np.where(np.isfinite(found), found, 0.0)
@@ -258,7 +259,7 @@ def _correlation(covariance: FloatArray, deviations: FloatArray) -> FloatArray:
 
 
 def _reach(freedom: float) -> float:
-    """Half of an interval of 95 %, in standard errors, of Student's t or of the normal law."""
+    """Half width of an interval of 95 % in standard errors: Student's t or normal distribution."""
     from scipy.stats import norm, t
 
     share = 0.5 + _CONFIDENCE / 2
@@ -274,9 +275,9 @@ def _intervals(
 
 
 def _directions(names: list[str], jacobian: FloatArray, noise: float) -> list[Direction]:
-    """The directions whose standard error, without priors, is as large as the variables."""
+    """Directions whose standard error without priors is at least the size of the variables."""
     count, p = jacobian.shape
-    # With zero rows, where residuals are fewer than numbers, no direction is left out.
+    # Zero rows keep all directions if there are fewer residuals than numbers.
     rows = np.vstack([jacobian, np.zeros((max(p - count, 0), p))])
     _, singular, directions = np.linalg.svd(rows, full_matrices=False)
     errors = noise / np.maximum(singular, _TINY)

@@ -34,9 +34,9 @@ __all__ = ["Prior", "Space", "Tie", "Values", "Variable"]
 
 _SCALES = ("log", "linear")
 _SPREADS = Range(1.0)
-_AT_BOUND = 1e-6  # of theta
-_SHOWN = 20  # numbers that are printed one by one
-_REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
+_AT_BOUND = 1e-6  # distance of theta to a bound below which it is at the bound
+_SHOWN = 20  # most numbers that are printed one by one
+_REACH = 1e3  # default bounds on the scale "log": factor to both sides of the first value
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,9 @@ class Variable:
             between the bounds, or between zero and twice the first value if a bound is infinite.
         prior: Knowledge before any observation: (mean, deviation), numbers or arrays of the shape
             of the value. On the scale "log" the deviation is the deviation of the natural
-            logarithm: 0.1 is about 10 %. The fit weighs the prior against the residuals, as one
-            more observation of that standard deviation, and draws the random starts from it. None
-            means that only the bounds are known.
+            logarithm: 0.1 is about 10 %. The prior counts as one more observation with that
+            standard deviation, and random starts are drawn from it. None means that only the bounds
+            are known.
     """
 
     value: ArrayLike
@@ -96,9 +96,9 @@ class Tie:
     """A variable that follows another one, such as a weft that is 1.2 times as stiff as the warp.
 
     Attributes:
-        of: Name of the variable that it follows, which is no tie.
-        by: Factor, or a function of the tensor of that variable; `workers` need one that can be
-            pickled.
+        of: Name of the variable to follow, which must not be a tie.
+        by: Factor, or a function of the tensor of that variable; with `workers` the function must
+            be picklable.
     """
 
     of: str
@@ -113,12 +113,12 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known beforehand of several variables together: means and a covariance.
+    """Joint prior of several variables: means and a covariance.
 
     Attributes:
         means: Name of each variable -> its mean, of the shape of its value.
-        covariance: Of all their numbers in the order of the names, symmetric and positive definite
-            [n, n]; of the natural logarithms of those on the scale "log".
+        covariance: Covariance of all numbers in the order of the names, symmetric and positive
+            definite [n, n]; on the scale "log", of the natural logarithms.
     """
 
     means: Mapping[str, object]
@@ -182,11 +182,11 @@ class Space:
         priors: Priors of several variables.
         all_variables: Names of all variables, in their order.
         variables: Names of the free variables.
-        names: Name of each number, as "stretch" or "velocity[0]".
+        names: Name of each number, such as "stretch" or "velocity[0]".
         first: The first values, as theta.
         low: Lowest values of theta.
         high: Highest values of theta.
-        means: Means of the priors, as theta; zero where there is none.
+        means: Means of the priors, as theta; zero for numbers without a prior.
         whitening: Matrix P [k, p] that makes P (theta - means) the residuals of the priors.
     """
 
@@ -285,7 +285,7 @@ class Space:
         return np.array(rows), np.linalg.cholesky(np.asarray(prior.covariance))
 
     def described(self) -> list[Any]:
-        """What evaluations belong to, in types that `torch.load` reads."""
+        """Return an identification of saved evaluations, in types that `torch.load` reads."""
         numbers = (self.low, self.high, self.means, self.whitening)
         kept = [[name, value.tolist()] for name, value in self._kept.items()]
         ties = [[n, t.of, "function" if callable(t.by) else t.by] for n, t in self._ties.items()]
@@ -317,7 +317,7 @@ class Space:
 
     @property
     def default_bounds(self) -> list[str]:
-        """Variables without given bounds, whose bounds are a factor from their first value."""
+        """Variables on the scale "log" with default bounds, a factor from their first value."""
         return [axis.name for axis in self._axes if axis.log and axis.is_default]
 
     def rates(self, theta: FloatArray) -> FloatArray:
@@ -337,7 +337,7 @@ class Space:
         return numbers
 
     def reach(self, factor: float) -> FloatArray:
-        """Distance of theta that is a factor on the scale "log", else as many sizes."""
+        """Distance of theta for a factor on the scale "log", else for that many sizes."""
         distances = np.full(len(self), factor)
         for axis in self._axes:
             if axis.log:

@@ -1,4 +1,4 @@
-"""Rest meshes that are cut at seams: faces keep triangles of their own, seams are sewn flat."""
+"""Rest meshes that are cut at seams: each face has its own triangle, seams are sewn flat."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from test_rest_shape import FIELDS, Elastic, curved, delaunay, flat, tetrahedron
 
 
 def cut(X, faces, island, moves):
-    """The rest mesh in which corners [f, 3] of different islands are apart, each island moved."""
+    """Rest mesh with separate vertices for corners [f, 3] of different islands, each moved."""
     pairs = np.stack([np.broadcast_to(island, faces.shape).ravel(), faces.ravel()], axis=1)
     distinct, rest_faces = np.unique(pairs, axis=0, return_inverse=True)
     rest = np.array([moves[k % len(moves)](X[v]) for k, v in distinct])
@@ -52,7 +52,7 @@ CUTS = [by_side, each_alone, quadrant]
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
 @pytest.mark.parametrize("islands", CUTS)
 def test_islands_anywhere_have_the_rest_shape_of_the_whole(islands, bending_model):
-    """Where the islands are, how they are turned and whether they are mirrored does not matter."""
+    """Positions, rotations and reflections of the islands do not change the rest shape."""
     X, faces = flat(6, 5)
     rest, rest_faces = cut(X, faces, islands(X, faces), RIGID)
     whole = Elastic(X, faces, bending_model).rest()
@@ -118,7 +118,7 @@ MESHES = [
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
 @pytest.mark.parametrize(("mesh", "islands"), MESHES)
 def test_derivatives_by_rest_vertices(mesh, islands, bending_model):
-    """All fields at once, also where a seam has two lengths; the tangent is the adjoint of it."""
+    """All fields at once, also if a seam has two lengths; the adjoint matches the tangent."""
     X, faces = mesh()
     moves = (turned(0.0), turned(0.1)) if islands is dart else UNEVEN
     rest, rest_faces = cut(X, faces, islands(X, faces), moves)

@@ -37,7 +37,7 @@ def rolled(X, start=0):
 
 
 def tube(seed=None, start=0, **keywords):
-    """A tube from one flat piece, whose seam is at a column."""
+    """A tube from one flat piece with a seam at a column."""
     rest, rest_faces = unrolled(COLUMNS, seed)
     row, column = np.divmod(np.arange(len(rest)), COLUMNS + 1)
     vertex = row * COLUMNS + (column + start) % COLUMNS
@@ -212,7 +212,7 @@ def test_the_default_barrier_is_the_one_of_the_sheet():
 
 
 def test_a_piece_of_another_size_stretches_what_it_is_sewn_to():
-    """At half the size a quarter of the mass, and no rest configuration in space."""
+    """A piece at half the size has a quarter of the mass; no rest configuration exists in space."""
     flat = dc.Cloth.grid((3, 2), (0.2, 0.1))
     island = (flat.vertices[flat.faces].mean(axis=1)[:, 0] > 0).astype(int)
     pairs = np.stack([np.repeat(island, 3), flat.faces.ravel()], axis=1)
@@ -240,7 +240,7 @@ def test_a_piece_of_another_size_stretches_what_it_is_sewn_to():
 
 @pytest.mark.parametrize("scheme", ["coupled", "split", "projective"])
 def test_gradients_by_the_rest_vertices(scheme):
-    """Of a step of a tube that falls on a box."""
+    """Gradients of a step of a tube that falls on a box."""
     cloth = tube(5)
     box = dc.RigidBody.box((0.3, 0.3, 0.1), pose=[0, 0, -0.0555, 1, 0, 0, 0])
     contact = (

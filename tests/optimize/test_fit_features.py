@@ -19,7 +19,7 @@ TIMES = torch.linspace(0.0, 2.0, 40, dtype=F64)
 
 
 def curve(values, times=TIMES):
-    """Something that needs no simulation: a decaying oscillation."""
+    """Residuals of a decaying oscillation, without a simulation."""
     return (
         torch.exp(-values["decay"] * times) * torch.cos(values["rate"] * times) + values["offset"]
     )

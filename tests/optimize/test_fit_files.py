@@ -60,7 +60,7 @@ def test_a_fit_comes_back_without_its_functions(found, way, tmp_path):
     if way == "file":
         found.save(tmp_path / "fit.pt")
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # what was said once is not said again
+            warnings.simplefilter("error")  # warnings of the fit are not repeated
             back = dc.Fit.load(tmp_path / "fit.pt")
     else:
         back = pickle.loads(pickle.dumps(found))

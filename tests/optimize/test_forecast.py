@@ -1,4 +1,4 @@
-"""After a fit: predictions with bands, which recording comes next, and what a fit prints."""
+"""After a fit: predictions with bands, information of a next recording, and the repr."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_a_random_walk_is_found_and_told():
 
 
 def test_stretches_widen_intervals_and_are_the_spread_of_white_noise():
-    """Of 20 series of 60 moments, whose noise repeats in pairs: variances are twice as large."""
+    """Noise that repeats in pairs doubles the variances (20 series of 60 moments)."""
     noise = np.repeat(white(5, (COUNT // 2, 20)), 2, axis=0)
     with pytest.warns(dc.CorrelatedResidualsWarning, match="that of correlated stretches"):
         found = fit_to(noise, shape=noise.shape)
@@ -174,7 +174,7 @@ def test_a_walk_has_the_covariance_of_its_increments():
 
 
 def test_series_of_markers_are_those_of_their_coordinates():
-    """Of 5 moments, 2 markers and 3 coordinates, with a marker that is missing twice."""
+    """Series of 5 moments, 2 markers and 3 coordinates, with a marker that is missing twice."""
     used = np.ones((5, 2, 3), dtype=bool)
     used[1:3, 0] = False
     points = list(np.zeros((5, 2, 3)))
@@ -189,7 +189,7 @@ def test_series_of_markers_are_those_of_their_coordinates():
 
 
 def test_nearly_collinear_numbers_are_named():
-    """Slip of a grip tells friction times squeeze; something else tells each a little."""
+    """Slip of a grip determines friction times squeeze; other data determine each weakly."""
     rng = np.random.default_rng(4)
     slip = torch.from_numpy(0.01 * rng.standard_normal(20))
     free = {"friction": dc.Variable(0.3), "squeeze": dc.Variable(2.0, scale="log")}

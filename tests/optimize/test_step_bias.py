@@ -1,4 +1,4 @@
-"""Bias of the time step: extrapolated residuals, and the shift of a fit that follows from them."""
+"""Bias of the time step: extrapolated residuals, and the resulting shift of a fit."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_numbers_at_a_bound_stay_and_are_named():
 
 
 def test_weights_of_a_robust_loss_count_in_the_shift():
-    """Without them an outlier of 30 deviations would turn the direction of the least squares."""
+    """Without weights an outlier of 30 deviations would turn the least-squares direction."""
 
     def at(h):
         clean = Decay(h)
