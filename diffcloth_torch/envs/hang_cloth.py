@@ -134,5 +134,4 @@ _RELEASE = 84
 _AJAR = 0.5  # effort that opens each finger by 1.7 cm; wider fingers would push the cloth
 _RISEN = 16  # transitions after which the hand may turn, as it is above the table
 _ALIGNED = 4  # transitions in which the hand moves to the place where it closes
-_CLOSED = 9  # transitions after which the hand is closed
 _GRIP = (-0.058, 0.0, 0.0)  # position of the hand's base from the edge of the cloth [m]
