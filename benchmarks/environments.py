@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import resource
 import sys
@@ -16,6 +15,7 @@ import click
 import torch
 
 from diffcloth_torch import envs
+from diffcloth_torch.learn.evaluation import wilson
 from diffcloth_torch.sim.solve import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
@@ -165,15 +165,6 @@ def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | N
         sys.stdout.flush()
         if page is not None:
             page.write_text(with_row(page.read_text(), row))
-
-
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """The interval of Wilson for a share, 95 %."""
-    z = 1.959964
-    share = successes / count
-    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
-    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 def with_row(text: str, row: str) -> str:

@@ -27,9 +27,10 @@ from typing import Any
 import click
 import torch
 
-from benchmarks.environments import roll_out, wilson
+from benchmarks.environments import roll_out
 from diffcloth_torch import envs
 from diffcloth_torch.learn import imitate, plan
+from diffcloth_torch.learn.evaluation import wilson
 
 METHODS = ("zero", "random", "script", "replay", "imitate", "plan")
 SOFT = {"opens_at": -1.0, "reach": 0.06}  # grasps with gradients

@@ -37,6 +37,7 @@ __all__ = [
     "follow",
     "seeds_of",
     "steps_of",
+    "wilson",
 ]
 
 Acts = Callable[[Tensor], Any] | str
@@ -89,16 +90,8 @@ class Episodes:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson confidence interval of the probability of success, 95 %.
-
-        Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", Journal of
-        the American Statistical Association 22 (1927).
-        """
-        n, share = len(self), float(self.success.double().mean())
-        square = _QUANTILE**2 / n
-        middle = (share + square / 2) / (1 + square)
-        half = _QUANTILE / (1 + square) * math.sqrt(share * (1 - share) / n + square / (4 * n))
-        return max(middle - half, 0.0), min(middle + half, 1.0)
+        """Confidence interval of the probability of success, 95 %; see `wilson`."""
+        return wilson(int(self.success.sum()), len(self))
 
     def __repr__(self) -> str:
         low, high = self.interval
@@ -109,6 +102,22 @@ class Episodes:
             type(self).__name__,
             [*parts, field_text("mean_return", self.mean_return), field_text("steps", self.steps)],
         )
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Confidence interval of a probability of success, 95 %.
+
+    Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", Journal of the
+    American Statistical Association 22 (1927).
+
+    Args:
+        successes: Number of successes.
+        count: Number of trials, >= 1.
+    """
+    share, square = successes / count, _QUANTILE**2 / count
+    middle = (share + square / 2) / (1 + square)
+    half = _QUANTILE / (1 + square) * math.sqrt(share * (1 - share) / count + square / (4 * count))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 @called("evaluate")

@@ -62,8 +62,7 @@ def blocks_of_fit(
 
     found = {}
     for k, name in enumerate(layout.names):
-        rows = np.flatnonzero(layout.block == k)
-        part = Layout([name], layout.block[rows], layout.series[rows], layout.time[rows])
+        rows, part = layout.part(k)
         square = float(residuals[rows] @ residuals[rows])
         freedom = len(rows) - float(leverage[rows].sum())
         rms = math.sqrt(square / max(len(rows), 1))
@@ -87,10 +86,9 @@ def are_correlated(residuals: FloatArray, layout: Layout) -> bool:
         return False
     limit = float(norm.isf(_CHANCE / len(layout.names)))
     for k in range(len(layout.names)):
-        rows = np.flatnonzero(layout.block == k)
+        rows, part = layout.part(k)
         if not len(rows):
             continue
-        part = Layout([""], layout.block[rows], layout.series[rows], layout.time[rows])
         if persistence(residuals[rows], part) > limit:
             return True
     return False

@@ -37,6 +37,12 @@ class Layout:
     series: NDArray[np.int64]
     time: NDArray[np.int64]
 
+    def part(self, block: int) -> tuple[NDArray[np.int64], Layout]:
+        """Indices of the residuals of one block, and their layout."""
+        rows = np.flatnonzero(self.block == block)
+        names = [self.names[block]]
+        return rows, Layout(names, np.zeros_like(rows), self.series[rows], self.time[rows])
+
     def pairs(self, lag: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Residuals of the same series that are `lag` moments apart: earlier ones, later ones."""
         width = int(self.time.max()) + 1 + lag
@@ -182,10 +188,9 @@ def walk(residuals: FloatArray, layout: Layout, directions: FloatArray) -> Float
     m, p = directions.shape
     found = np.zeros((p, p))
     for block in range(len(layout.names)):
-        rows = np.flatnonzero(layout.block == block)
+        rows, part = layout.part(block)
         if not len(rows):
             continue
-        part = Layout([""], layout.block[rows], layout.series[rows], layout.time[rows])
         step, noise = _increments(residuals[rows], part)
         factor = m / max(m - p, 1)
         _, series = np.unique(part.series, return_inverse=True)
