@@ -72,7 +72,7 @@ class ImitateStage(Section):
     teacher: Literal["scripted", "plans"] = "scripted"
     rounds: Episodes = 6
     episodes: Episodes = 24
-    iterations: Episodes = 600
+    iterations: Episodes = 1000
 
 
 class UpdateStage(Section):
