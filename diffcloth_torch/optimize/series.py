@@ -203,11 +203,14 @@ def walk(residuals: FloatArray, layout: Layout, directions: FloatArray) -> Float
 
 
 def _increments(residuals: FloatArray, layout: Layout) -> tuple[float, float]:
-    """Variances of the walk's steps and of the white noise."""
+    """Variances of the walk's steps and of the white noise; without increments all is noise."""
     early, late = layout.pairs(1)
+    if not len(early):
+        return 0.0, float(np.square(residuals).mean())
     change = np.full(len(residuals), np.nan)
     change[early] = residuals[late] - residuals[early]
     variance = float(np.nanmean(change**2))
-    covariance = float(np.nanmean(change[early] * change[late])) if len(early) else 0.0
-    noise = 0.0 if np.isnan(covariance) else float(np.clip(-covariance, 0.0, 0.5 * variance))
+    both = change[early] * change[late]
+    covariance = 0.0 if np.isnan(both).all() else float(np.nanmean(both))
+    noise = float(np.clip(-covariance, 0.0, 0.5 * variance))
     return variance - 2 * noise, noise

@@ -43,6 +43,31 @@ def walking(seed, shape=(COUNT,)):
     return 0.5 * white(seed, shape).cumsum(axis=0)
 
 
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
+def test_a_block_without_successive_moments_counts_as_white_noise_beside_walks():
+    """A measurement of one number at one moment narrows its interval."""
+
+    def fitted(**others):
+        def residuals(parameters, values):
+            decay = values["a"] * torch.exp(-values["b"] * TIMES)
+            blocks = {"decay": (decay - CLEAN - NOISE * torch.as_tensor(walking(1))) / NOISE}
+            single = {
+                n: (values["a"] - TRUTH["a"] + e).reshape(1, -1) / NOISE for n, e in others.items()
+            }
+            return blocks | single
+
+        return dc.fit(variables(), residuals, covariance="robust")
+
+    alone = fitted()
+    both = fitted(single=1e-3 * torch.tensor([1.0, -2.0, 1.0]))
+    assert alone.noise_model == both.noise_model == "random walks"
+    for low, high in both.intervals.values():
+        assert np.isfinite([low, high]).all()
+    widths = [np.ptp(found.intervals["a"]) for found in (both, alone)]
+    assert 0 < widths[0] < widths[1]
+
+
 def inside(found):
     ends = found.intervals
     return {name: ends[name][0] < true < ends[name][1] for name, true in TRUTH.items()}
