@@ -1,16 +1,16 @@
-"""What each method reaches on each task, at starts that it has not seen.
+"""Success of each method on each task, at starts that it was not trained on.
 
     python -m benchmarks.learning FoldCloth --method imitate --seed 0
     python -m benchmarks.learning                     # all tasks and methods, seeds 0, 1 and 2
     python -m benchmarks.learning --only-show
 
-Each task, method and seed is a line of JSON in the file of results; what the file has is not made
-again. `return` and `success` are means of the episodes, `interval` is Wilson's of the successes at
-95 %, `steps` are the environment steps of learning, `minutes` those of the processor.
+Each task, method and seed is a line of JSON in the file of results; existing lines are not
+repeated. `return` and `success` are means over the episodes, `interval` is the Wilson interval of
+the success at 95 %, `steps` the environment steps of learning, `minutes` its processor time.
 
 `zero`, `random` and `script` learn nothing; `replay` repeats the actions of one scripted episode.
-`imitate` is `dc.learn.imitate` of the script. `plan` is `dc.learn.plan`: its successes are those of
-the starts for which it plans, as no policy comes of it.
+`imitate` is `dc.learn.imitate` of the script. `plan` is `dc.learn.plan`: its success refers to the
+starts for which it plans, because it returns no policy.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def main(
 
 
 def key_of(row: dict[str, Any]) -> tuple[str, int, str, int]:
-    """What is not made again."""
+    """Return task, size, method and seed, which identify a row."""
     return row["task"], row["size"], row["method"], row["seed"]
 
 

@@ -23,7 +23,7 @@ bool solve(const FreeMotion<double>& motion, VectorXd& x) {
   const Configuration<double>& start = motion.start;
   const std::vector<PlacedBody<double>> here =
       place(motion.tree, motion.inertia, start.rotation, start.joints);
-  // Start without velocity products, except those of prescribed velocities.
+  // Start with the products of prescribed velocities alone.
   const VectorXd carried = rates(motion.tree, motion.inertia, here, motion.known).momentum;
   const Eigen::MatrixXd mass = mass_matrix(motion.tree, motion.inertia, here);
   const VectorXd rest = motion.given - carried;

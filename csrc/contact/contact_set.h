@@ -126,7 +126,7 @@ class ContactHessian {
 /// Terms with identical nearest features are merged into one contact, whose coefficient is the sum of
 /// theirs.
 ///
-/// Positions are those of the whole collision mesh, cloths first, then bodies: 3 doubles a vertex.
+/// Positions cover the whole collision mesh, cloths first, then bodies: 3 doubles per vertex.
 /// `prescribed` marks vertices with prescribed motion (pins, bodies that dynamics does not move): pairs
 /// of such vertices alone carry no energy.
 class ContactModel {

@@ -92,9 +92,9 @@ struct Model {
 /// @throws std::invalid_argument if damping has no start of the step or no time step
 void prepare(Model& model, const Slots& slots);
 
-/// prepare() for models of one rest shape, whose numbers often equal those of an earlier model: the
-/// backward of a step uses the numbers of the step, a step the numbers of the previous one, except for
-/// the dependence of damping on the start of the step.
+/// Cache of prepare() for models of one rest shape. Inputs often repeat: the backward pass of a step has
+/// the inputs of the step, a step has the inputs of the previous one, except for the start of the step,
+/// on which damping depends.
 class PreparedCache {
  public:
   PreparedCache() = default;

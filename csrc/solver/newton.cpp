@@ -240,7 +240,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   if (direction.kind == Kind::kFactored && step < goal_ && !directions_.is_certified()) {
     residual_ = step / walk_.f.h;
     if (!directions_.confirm()) return escape();
-    step = walk_.displacement(directions_.p());  // maybe that of a factor in doubles
+    step = walk_.displacement(directions_.p());  // possibly by a factor in double precision
   }
   const bool lost = is_lost(step);
   // An excursion must not end in a minimum above its start.

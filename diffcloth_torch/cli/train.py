@@ -387,7 +387,7 @@ class _Job:
         return policy
 
     def _reported(self, evaluations: list[dict[str, Any]]) -> dict[str, Any]:
-        """How well the best policy does from starts that nothing before has seen."""
+        """Evaluate the best policy at starts that were not used before."""
         seed = purpose_seed(self.trainer.options.seed, "report")
         found = evaluate(
             self._make_env,

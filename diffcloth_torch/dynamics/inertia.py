@@ -13,7 +13,7 @@ from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 __all__ = ["ROOT", "Inertia", "rigid_totals"]
 
 ROOT = 6
-"""Number of velocities of a root, before those of the joints: of its center, then angular."""
+"""Number of velocities of a root, before the joint velocities: linear at its center, angular."""
 
 
 class Inertia(NamedTuple):

@@ -25,7 +25,7 @@ contact, yield this effort from the change of momentum:
 
     M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
 
-The rows of a floating root are those of the whole robot, without any tau_c: they determine nu_n+1
+The rows of a floating root belong to the whole robot, without any tau_c: they determine nu_n+1
 of the root, with the f for which the solve moved the root from the prediction. The metric of the
 solve differs from M along the path, and by this difference the joints would add momentum to the
 robot.

@@ -138,7 +138,7 @@ class BuiltTask(Task):
         return env_time.double()[:, None] / self.horizon
 
     def sensed(self, env: EnvState) -> Mapping[str, Tensor]:
-        """Features; with a camera its view in the place of those of the cloth.
+        """Features; with a camera, its view replaces the features of the cloth.
 
         A depth image [m], by rows, and the pose of the camera [B, 7]; or points [m], one behind the
         other. Pose and points are in the frame of the task.

@@ -169,7 +169,7 @@ class Sight:
         return (weights[..., None] * corners).sum(dim=-2)
 
     def _views(self, state: State) -> Iterator[tuple[Seen, NDArray[np.int64]]]:
-        """What the camera sees of each environment, and the corners of the triangles."""
+        """View of each environment, and the corners of the triangles."""
         meshes = state.detach().meshes().values()
         starts = np.cumsum([0, *(vertices.shape[-2] for vertices, _ in meshes)])
         faces = np.concatenate(

@@ -93,7 +93,7 @@ class Material:
 
     @property
     def is_orthotropic(self) -> bool:
-        """Whether any attribute of woven cloth is set."""
+        """True if any attribute of woven cloth is set."""
         return any(getattr(self, field) is not None for field in STAND_INS)
 
     def per_face(self, field: str) -> float | FloatArray:

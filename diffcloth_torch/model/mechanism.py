@@ -130,5 +130,5 @@ class Mechanism:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether forces move the root or any joint."""
+        """True if forces move the root or any joint."""
         return self.base == "floating" or bool(self.forced.any())

@@ -147,7 +147,7 @@ class Scene:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether any body or robot is dynamic, i.e., moved by forces."""
+        """True if any body or robot is dynamic, i.e., moved by forces."""
         bodies = any(body.motion == "dynamic" for body in self.bodies)
         return bodies or any(robot.mechanism.is_dynamic for robot in self.robots)
 

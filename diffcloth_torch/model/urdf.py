@@ -108,7 +108,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether the joint moves and does not mimic another joint."""
+        """True if the joint moves and does not mimic another joint."""
         return self.type != "fixed" and self.mimic is None
 
 

@@ -63,7 +63,7 @@ class Identify(ConfiguredTask):
 
     @property
     def checks_step(self) -> bool:
-        """Whether the bias of the time step is to be estimated: of motions seen by markers."""
+        """True if the bias of the time step is estimated: for motions observed by markers."""
         if self._fit.extrapolate or not self._fit.step_check:
             return False
         sections = self._fit.trajectories
@@ -76,7 +76,7 @@ class Identify(ConfiguredTask):
         return 2.0 if self.simulator.integrator == "second_order" else 1.0
 
     def finer(self, observed: Observations) -> Observations:
-        """The same observations, compared with simulations with half the time step."""
+        """Compare these observations with simulations at half the time step."""
         return Observations(
             [
                 replace(t, motion=_halved(self._fit_config, t, self._source))
@@ -239,7 +239,7 @@ def _trajectory(config: FitConfig, section: TrajectorySection, source: Path) -> 
 
 
 def _halved(config: FitConfig, observed: _Observed, source: Path) -> _Motion:
-    """The same motion with half the time step."""
+    """Return the motion at half the time step."""
     section, task = observed.section, observed.motion.task
     changes = [
         *section.changes,

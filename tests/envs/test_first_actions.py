@@ -1,4 +1,4 @@
-"""Actions from which learning begins: they move what counts, in both frames."""
+"""Actions from which learning begins: they move the sheet, tool or cube, in both frames."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ f 1/1 2/2 3/3\nf 2/4 4/5 3/6\n"""
 
 
 def test_seams_of_the_texture_are_joined_in_space(write):
-    """Two islands: the vertices and faces are those of the file, the rest mesh has its own."""
+    """Two islands: vertices and faces come from the file, the rest mesh has its own."""
     cloth = dc.Cloth.load(write(SEWN), rest="uv", rest_scale=0.1)
     assert len(cloth.vertices) == 4
     assert cloth.faces.tolist() == [[0, 1, 2], [1, 3, 2]]

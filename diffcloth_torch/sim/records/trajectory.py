@@ -91,7 +91,7 @@ class Trajectory(list[State]):
         if asked.dim() != 1:
             raise InvalidInput(f"{owner}: `times` must have shape [K], got {list(asked.shape)}")
         numbers = numbers_of(asked)
-        # A time may leave the ends by rounding, as that of a camera with the period of the steps.
+        # Rounding may move a time beyond the ends, if a camera has the period of the steps.
         slack = _ROUNDING * max(abs(known[0]), abs(known[-1]))
         outside = ~((numbers >= known[0] - slack) & (numbers <= known[-1] + slack))
         if outside.any():

@@ -445,7 +445,7 @@ def _turns(robot: Mechanism) -> list[bool]:
 
 
 def _resting(given: Given) -> Given:
-    """The same inputs at rest, without resistance to motion."""
+    """Return the inputs at rest, without resistance to motion."""
     parameters = given.parameters
     at_rest = {n: PARAMETERS[n].at_rest for n in parameters}
     values = {n: 0.0 * parameters[n] + v for n, v in at_rest.items() if v is not None}
