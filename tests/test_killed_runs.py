@@ -33,6 +33,24 @@ report_episodes: 1
 viewers: []
 """
 TRYOUT = "tryout: {seeds: [0, 1], updates: 2}\n"
+# Each of the stages takes seconds, so that kills hit both.
+STAGES = """
+task: train
+environment:
+  name: FoldCloth
+  options: {size: 5, horizon: 4, opens_at: -1.0, reach: 0.06}
+stages:
+  - {kind: imitate, rounds: 2, episodes: 2, iterations: 60}
+  - {kind: apg, updates: 6}
+trainer: {horizon: 4, hidden: [8], plan_knots: 3, held_out: 2, check_every: 2}
+num_envs: 2
+chunk: 1
+evaluate_every: 1
+episodes: 1
+selection_episodes: 1
+report_episodes: 1
+viewers: []
+"""
 FIT = """
 task: identify
 simulation: {dt: 0.01, steps: 4}
@@ -63,6 +81,7 @@ CASES = {
     "fit": (FIT, []),
     "train": (TRAIN, []),
     "train with a tryout": (TRAIN + TRYOUT, []),
+    "train with stages": (STAGES, []),
 }
 UNCERTAIN = (
     "seconds",
@@ -114,7 +133,7 @@ def bits(command, out):
         kept = torch.load(out / "policy.pt", weights_only=True)
         numbers = [kept["policy"][name].numpy().tobytes() for name in sorted(kept["policy"])]
         record = json.loads((out / "train.json").read_text())
-        names = ("evaluations", "tried", "starts", "best", "report")
+        names = ("evaluations", "tried", "starts", "stages", "best", "report")
         return numbers, without_times([record[name] for name in names])
     if command == "fit":
         return without_times(json.loads((out / "fit.json").read_text()))
@@ -145,7 +164,7 @@ def test_killed_commands_go_on_with_the_same_bits(context, tmp_path, case, numbe
     assert whole.exitcode == 0
     expected = bits(command, tmp_path / "whole")
     generator = random.Random(7)
-    killed = 0
+    killed = []  # whether an evaluation was on disk, which follows the stages before updates
     for trial in range(10):
         out = tmp_path / f"out_{trial}"
         for _ in range(generator.choice([1, 2])):
@@ -154,7 +173,7 @@ def test_killed_commands_go_on_with_the_same_bits(context, tmp_path, case, numbe
             running = process(context, last)
             time.sleep(generator.uniform(0, seconds))
             if running.is_alive():
-                killed += 1
+                killed.append((out / "train.json").exists())
                 os.kill(running.pid, signal.Signals[number])
             running.join(PATIENCE)
             assert running.exitcode is not None
@@ -164,5 +183,7 @@ def test_killed_commands_go_on_with_the_same_bits(context, tmp_path, case, numbe
         assert last.exitcode == 0
         assert bits(command, out) == expected
         assert not [f for f in out.rglob("*") if f.name.endswith((".part", ".lock"))]
-    assert killed >= 5
-    print(f"{case}, {number}: {killed} killed, {seconds:.2f} s alone")
+    assert len(killed) >= 5
+    if "stages" in case:
+        assert {*killed} == {False, True}
+    print(f"{case}, {number}: {len(killed)} killed, {sum(killed)} late, {seconds:.2f} s alone")
