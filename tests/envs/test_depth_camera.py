@@ -161,6 +161,22 @@ def test_a_deforming_body_hides_a_cloth_and_has_no_points():
     assert len(points.unique(dim=0)) == 128
 
 
+@pytest.mark.parametrize("face", [0, -1])
+def test_a_triangle_that_fills_the_image_has_all_points(face):
+    """The first and the last triangle of a cloth, with the triangles of a body after them."""
+    cloth = dc.Cloth.grid((3, 3), (0.4, 0.4), pose=[0, 0, 0.1, 1, 0, 0, 0])
+    scene = dc.Scene([cloth], [dc.RigidBody.plane(4.0)])
+    state = dc.Simulator(scene, 0.01).initial_state(1)
+    vertices, faces = state.meshes()[scene.cloth_names[0]]
+    x, y, _ = vertices[0, faces[face]].mean(dim=0).tolist()
+    camera = envs.DepthCamera([x, y, 1.0], [x, y, 0.0], up=[0, 1, 0], field_of_view=4)
+    points = Sight(camera, scene).points(state)[0]
+    torch.testing.assert_close(points[:, 2], torch.full((128,), 0.1, dtype=torch.float64))
+    # Half an image is 0.9 tan 2 deg = .031 m wide; the triangle reaches .067 m from its centroid.
+    away = points[:, :2] - torch.tensor([x, y])
+    assert 0.02 < float(away.abs().max()) < 0.032
+
+
 def test_nothing_is_seen_beyond_the_far_plane():
     away = {"position": [0.0, -3.0, 1.0], "target": [0.0, -4.0, 1.0]}  # with the back to the strips
     depth = make("TwoCloths", observation="depth", camera=envs.DepthCamera(**away, far=2.5))

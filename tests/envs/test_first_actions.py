@@ -40,6 +40,15 @@ def test_rewards_have_gradients_there(name):
 
 
 @pytest.mark.parametrize("frame", envs.env.FRAMES)
+def test_a_sheet_that_pushes_keeps_its_height(frame):
+    before, after, _ = held("PushCube", frame, steps=1)
+    pins = [4 * 3, 4 * 4 - 1]  # the upper corners
+    moved = (after.state.positions - before.state.positions)[:, pins]
+    assert bool((moved[..., :2].norm(dim=-1) > 0.001).all())
+    assert bool((moved[..., 2].abs() < 1e-9).all())
+
+
+@pytest.mark.parametrize("frame", envs.env.FRAMES)
 @pytest.mark.parametrize("name", ["FoldCloth", "LiftCloth", "PushCube"])
 def test_tools_rise_or_come_nearer(name, frame):
     before, after, _ = held(name, frame)
