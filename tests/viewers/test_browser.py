@@ -174,6 +174,44 @@ class TestPages:
         state.positions.zero_()
         np.testing.assert_array_equal(browser.motion[0].positions, before)
 
+    def test_a_slider_ends_at_the_last_moment(self, falling):
+        scene, states = falling
+        browser = Browser(scene, port=8472)
+        browser.show(states[0][0])
+        assert browser.url  # the server begins, with the first moment
+        try:
+            for state in one(states[1:4]):
+                browser.show(state)
+            assert browser._moment.max == len(browser.motion) - 1 == 3
+        finally:
+            browser.close()
+
+    def test_forces_end_and_gradients_begin_at_their_points(self, falling):
+        scene, states = falling
+        state = states[-1][0]
+        generator = torch.Generator().manual_seed(0)
+        gradient = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
+        browser = Browser(scene, port=8473, arrows=["forces", "gradient"])
+        browser.show(state, gradient)
+        assert browser.url
+        try:
+            arrows = {what: a.points for (_, what), a in browser._drawing._arrows.items()}
+        finally:
+            browser.close()
+        cloth, ball = state.positions.numpy(), scene.bodies[0].vertices
+        contact = np.concatenate([state.contact_forces.numpy(), state.body_forces.numpy()])
+        for what, places, vectors, end in (
+            ("forces", np.concatenate([cloth, ball]), contact, 1),
+            ("gradient", cloth, gradient.numpy(), 0),
+        ):
+            lengths = np.linalg.norm(vectors, axis=1)
+            seen = lengths > 0.01 * lengths.max()
+            # Points of a page are of single precision.
+            np.testing.assert_allclose(arrows[what][:, end], places[seen], atol=1e-6)
+            along = arrows[what][:, 1] - arrows[what][:, 0]
+            ratios = np.linalg.norm(along, axis=1) / lengths[seen]
+            np.testing.assert_allclose(along, vectors[seen] * ratios.mean(), atol=1e-5)
+
     @pytest.mark.slow
     def test_a_page_of_its_own_plays(self, falling, chromium, tmp_path):
         scene, states = falling

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sys
 import typing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.viewers.curves import draw_loss_curve
-from diffcloth_torch.viewers.floor import BACKGROUND
+from diffcloth_torch.viewers.floor import BACKGROUND, Shadow
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, Paint, Pictures
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
@@ -290,6 +291,17 @@ class TestRecord:
         with pytest.raises(type(error)):
             record(task, tmp_path, failing())
         assert (tmp_path / "animation.png").exists() == drawn
+
+
+@pytest.mark.parametrize(("height", "shades"), [(-0.1, False), (0.0, False), (0.1, True)])
+def test_surfaces_above_a_floor_cast_a_shadow(height, shades):
+    """A surface that lies on the floor covers it, and has no shadow around itself."""
+    shadows = []
+    floor = SimpleNamespace(height=0.0, half_side=1.0, center=np.zeros(2), shade=shadows.append)
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.2 + [0, 0, height]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    Shadow(floor, np.array([0.3, 0.1, 1.0])).cast([(square, faces)])
+    assert bool(shadows[0].any()) == shades
 
 
 # --- without a configuration --------------------------------------------------------------------
