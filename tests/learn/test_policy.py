@@ -13,6 +13,7 @@ import torch
 import diffcloth_torch as dc
 from diffcloth_torch.checkpoint import write_checkpoint
 from diffcloth_torch.learn import Policy, PolicySizes, Trainer, TrainerOptions, load_policy
+from diffcloth_torch.learn import policy as policy_module
 from diffcloth_torch.learn.policy import begin_at
 
 SIZES = PolicySizes(7, 3, time=6)
@@ -42,6 +43,29 @@ def assert_same_weights(a, b):
     a, b = a.state_dict(), b.state_dict()
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        TrainerOptions("apg", hidden=(64, 32)),
+        TrainerOptions("shac", hidden=(64, 32)),
+        TrainerOptions("sapo", hidden=(64, 32), critics=1),
+        TrainerOptions("sapo", hidden=(64, 32), critics=3),
+    ],
+    ids=["apg", "shac", "sapo-1", "sapo-3"],
+)
+def test_the_required_memory_is_that_of_all_weights(monkeypatch, options):
+    counts = {}
+
+    def check(name, count, each, of_what):
+        counts[of_what] = count
+
+    monkeypatch.setattr(policy_module, "check_memory", check)
+    policy = Policy(PolicySizes(40, 3, time=6), options)
+    held = sum(tensor.numel() for tensor in policy.state_dict().values())
+    # Measured: up to 2.6 % more, as the last layer of a critic has one output.
+    assert held <= counts["a weight"] <= 1.05 * held
 
 
 class TestSizes:

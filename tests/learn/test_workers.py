@@ -313,6 +313,23 @@ def test_ranks_need_a_job():
         Ranks()
 
 
+class _SecondRank(Ranks):
+    """The second of two ranks, whose first has other options or weights."""
+
+    def __init__(self):
+        self.rank, self.size = 1, 2
+
+    def _gather(self, value):
+        return [b"other", value]
+
+
+def test_an_update_needs_the_same_options_and_weights_in_all_ranks():
+    trainer = Trainer(MAKE, OPTIONS, num_envs=2, chunk=1, workers=_SecondRank())
+    with pytest.raises(InvalidInput, match="options and weights must be the same in all processes"):
+        trainer.update()
+    assert trainer.updates == 0
+
+
 def test_objects_that_cannot_be_pickled_are_refused():
     with pytest.raises(InvalidInput, match="can be pickled"):
         Trainer(lambda num_envs: MAKE(num_envs=num_envs), OPTIONS, workers=Processes(1))
