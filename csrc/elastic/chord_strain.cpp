@@ -1,25 +1,45 @@
 #include "elastic/chord_strain.h"
 
-#include <array>
-
 #include "elastic/elements.h"
+#include "elastic/face_batches.h"
 #include "elastic/symmetric2.h"
 
 namespace diffcloth::elastic {
 namespace {
 
-/// q_0, a squared strain: larger than in smooth motion at common time steps, smaller than a visible strain.
-constexpr double kFree = 1e-4;
+constexpr double kFree = kFreeStrainSq;
 
-/// phi and its derivatives.
+/// Derivatives of phi.
 struct Law {
   explicit Law(double q)
-      : value(0.5 * q * q / (q + kFree)),
-        first(0.5 * q * (q + 2.0 * kFree) / ((q + kFree) * (q + kFree))),
+      : first(0.5 * q * (q + 2.0 * kFree) / ((q + kFree) * (q + kFree))),
         second(kFree * kFree / ((q + kFree) * (q + kFree) * (q + kFree))) {}
 
-  double value, first, second;
+  double first, second;
 };
+
+/// Visit the stiffnesses of a model, or their cotangents, with their shares in the mean stiffness.
+template <class Stiffnesses, class Visit>
+void for_each_share(const Model& model, Stiffnesses& of, Visit&& visit) {
+  if (!is_woven(model)) return visit(of.stretch, 1.0);
+  visit(of.stretch, 0.25);
+  visit(of.stretch_weft, 0.25);
+  visit(of.stretch_shear, 0.5);
+}
+
+/// The mean stiffness of a face, or its tangent.
+template <class Stiffnesses>
+double mean_stiffness(const Model& model, const Stiffnesses& of, Index f) {
+  double mean = 0.0;
+  for_each_share(model, of,
+                 [&](const std::vector<double>& k, double share) { mean += share * k[f]; });
+  return mean;
+}
+
+const StretchKernels& kernels_here() {
+  static const StretchKernels& kernels = stretch_kernels(linalg::chosen_level());
+  return kernels;
+}
 
 double dot(const Mat2& a, const Mat2& b) { return a.cwiseProduct(b).sum(); }
 
@@ -55,79 +75,45 @@ ChordStrain::ChordStrain(ElasticPotential& elastic, const double* shift, const d
       shift_(shift),
       center_(center) {}
 
-double ChordStrain::stiffness(Index f) const {
-  if (!is_woven(model_)) return model_.stretch[f];
-  return 0.25 * (model_.stretch[f] + model_.stretch_weft[f]) + 0.5 * model_.stretch_shear[f];
-}
-
-const ChordStrain::Constants& ChordStrain::constants(Index f) const {
-  if (constants_.empty()) {
-    for (Index k = 0; k < face_count(model_); ++k) {
-      constants_.push_back({.D = face_gradient(model_, k, shift_),
-                            .center = face_gradient(model_, k, center_),
-                            .weight = stiffness(k) * model_.rest->area[k]});
+const std::vector<ChordBatch>& ChordStrain::batches() const {
+  if (batches_.empty()) {
+    std::vector<double> weight;
+    for (Index f = 0; f < face_count(model_); ++f) {
+      weight.push_back(mean_stiffness(model_, model_, f) * model_.rest->area[f]);
     }
+    batches_ = chord_batches(model_, elastic_.slots(), shift_, center_, weight);
   }
-  return constants_[f];
+  return batches_;
 }
 
 ChordStrain::Face ChordStrain::face(Index f, const double* x) const {
-  const Constants& of = constants(f);
-  const Mat32 G = face_gradient(model_, f, x) - of.center;
-  const Mat2 e = symmetric_part(G.transpose() * of.D);
-  return {.D = of.D, .G = G, .e = e, .law = Law(dot(e, e)), .weight = of.weight};
+  const Mat32 D = face_gradient(model_, f, shift_);
+  const Mat32 G = face_gradient(model_, f, x) - face_gradient(model_, f, center_);
+  const Mat2 e = symmetric_part(G.transpose() * D);
+  return {.D = D,
+          .G = G,
+          .e = e,
+          .law = Law(dot(e, e)),
+          .weight = mean_stiffness(model_, model_, f) * model_.rest->area[f]};
 }
 
 double ChordStrain::energy(const double* x) const {
-  double total = 0.0;
-  for (Index f = 0; f < face_count(model_); ++f) {
-    const Face at = face(f, x);
-    total += at.weight * at.law.value;
-  }
-  return total;
+  return kernels_here().chord_energy(batches().data(), batches().size(), x);
 }
 
 double ChordStrain::energy_change(const double* x, const double* to) const {
-  double total = 0.0;
-  for (Index f = 0; f < face_count(model_); ++f) {
-    const Face from = face(f, x);
-    const Face end = face(f, to);
-    // phi(q') - phi(q) = 1/2 (q' - q) (q q' + q_0 (q + q')) / ((q + q_0) (q' + q_0)).
-    const double q = dot(from.e, from.e);
-    const double q_end = dot(end.e, end.e);
-    const double step = dot(end.e - from.e, end.e + from.e);
-    total += 0.5 * from.weight * step * (q * q_end + kFree * (q + q_end)) /
-             ((q + kFree) * (q_end + kFree));
-  }
-  return total;
+  return kernels_here().chord_energy_change(batches().data(), batches().size(), x, to);
 }
 
 void ChordStrain::add_gradient(const double* x, double* g) const {
-  for (Index f = 0; f < face_count(model_); ++f) scatter(model_, f, face(f, x).stress(), g);
+  kernels_here().add_chord_gradient(batches().data(), batches().size(), x, g);
 }
 
 void ChordStrain::add_hessian(const double* x,
                               Curvature /*curvature*/,
                               linalg::BlockMatrix& A) const {
-  for (Index f = 0; f < face_count(model_); ++f) {
-    const Face at = face(f, x);
-    if (at.law.first == 0.0) continue;
-    const mesh::ShapeGradient& g = model_.rest->shape_gradient[f];
-    const Mat3 DD = at.D * at.D.transpose();
-    const Mat32 De = at.D * at.e;
-    std::array<Vec3, 3> turned;
-    std::array<Vec3, 3> along;
-    for (int p = 0; p < 3; ++p) {
-      turned[p] = at.D * g.row(p).transpose();
-      along[p] = De * g.row(p).transpose();
-    }
-    const double first = at.weight * at.law.first;
-    const double second = 4.0 * at.weight * at.law.second;
-    A.add_rows(model_.topology->faces[f], [&](int p, int q) -> Mat3 {
-      return first * (g.row(p).dot(g.row(q)) * DD + turned[q] * turned[p].transpose()) +
-             second * along[p] * along[q].transpose();
-    });
-  }
+  kernels_here().add_chord_hessian(batches().data(), batches().size(), x, A.slot_of_base().data(),
+                                   A.blocks());
 }
 
 void ChordStrain::add_hessian_product(const double* x, const double* z, double* y) const {
@@ -156,15 +142,10 @@ void ChordStrain::accumulate(const double* x, const double* z) {
     if (wanted == Wanted::kNone) continue;
     const double weight_bar = 2.0 * at.law.first * along;
     const double k_bar = weight_bar * model_.rest->area[f];
-    if (is_woven(model_)) {
-      bar.stretch[f] += 0.25 * k_bar;
-      bar.stretch_weft[f] += 0.25 * k_bar;
-      bar.stretch_shear[f] += 0.5 * k_bar;
-    } else {
-      bar.stretch[f] += k_bar;
-    }
+    for_each_share(model_, bar,
+                   [&](std::vector<double>& k, double share) { k[f] += share * k_bar; });
     if (wanted != Wanted::kMaterialsAndRest) continue;
-    bar.rest.area[f] += weight_bar * stiffness(f);
+    bar.rest.area[f] += weight_bar * mean_stiffness(model_, model_, f);
     mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
     scatter_gradient_bar(model_, f, D_bar, shift_, g_bar);
     scatter_gradient_bar(model_, f, G_bar, x, g_bar);
@@ -182,13 +163,10 @@ void ChordStrain::add_tangent(const double* x, double* y) const {
     Mat32 G_dot = -face_gradient(model_, f, center_dot.data());
     double weight_dot = 0.0;
     if (changing.materials) {
-      const double k_dot = is_woven(model_) ? 0.25 * (dot_of.stretch[f] + dot_of.stretch_weft[f]) +
-                                                  0.5 * dot_of.stretch_shear[f]
-                                            : dot_of.stretch[f];
-      weight_dot += k_dot * model_.rest->area[f];
+      weight_dot += mean_stiffness(model_, dot_of, f) * model_.rest->area[f];
     }
     if (changing.rest) {
-      weight_dot += stiffness(f) * dot_of.rest.area[f];
+      weight_dot += mean_stiffness(model_, model_, f) * dot_of.rest.area[f];
       const mesh::ShapeGradient& g_dot = dot_of.rest.shape_gradient[f];
       D_dot += face_gradient(model_, f, g_dot, shift_);
       G_dot += face_gradient(model_, f, g_dot, x) - face_gradient(model_, f, g_dot, center_);

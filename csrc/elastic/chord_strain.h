@@ -4,6 +4,7 @@
 
 #include "elastic/elastic_potential.h"
 #include "elastic/frame.h"
+#include "elastic/stretch_lanes.h"
 #include "potential/potential.h"
 
 namespace diffcloth::elastic {
@@ -40,21 +41,14 @@ class ChordStrain final : public Potential {
 
  private:
   struct Face;
-  /// Numbers of a face that do not depend on x.
-  struct Constants {
-    Mat32 D;        ///< F(d)
-    Mat32 center;   ///< F(c)
-    double weight;  ///< k A
-  };
-  const Constants& constants(Index f) const;
   Face face(Index f, const double* x) const;
-  double stiffness(Index f) const;
+  const std::vector<ChordBatch>& batches() const;
 
   ElasticPotential& elastic_;
   const Model& model_;
   const double* shift_;
   const double* center_;
-  mutable std::vector<Constants> constants_;  ///< constants of all faces; empty until first used
+  mutable std::vector<ChordBatch> batches_;  ///< empty until first used
 };
 
 }  // namespace diffcloth::elastic

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cstddef>
+#include <numeric>
 
 #include "elastic/elements.h"
 #include "elastic/face_terms.h"
@@ -124,6 +125,33 @@ void put_start_gradients(const Model& model,
     for (int k = 0; k < 6; ++k)
       batches[i / kStretchLanes].start[k][i % kStretchLanes] = F.data()[k];
   }
+}
+
+std::vector<ChordBatch> chord_batches(const Model& model,
+                                      const Slots& slots,
+                                      const double* shift,
+                                      const double* center,
+                                      const std::vector<double>& weight) {
+  std::vector<Index> all(weight.size());
+  std::iota(all.begin(), all.end(), 0);
+  const FaceLanes lanes(model, slots, all);
+  std::vector<ChordBatch> batches;
+  batches.reserve(lanes.size());
+  for (std::size_t b = 0; b < lanes.size(); ++b) {
+    ChordBatch& batch = batches.emplace_back();
+    batch.faces = lanes.batch(b, [](Index) { return Mat2(Mat2::Identity()); });
+    for (int l = 0; l < kStretchLanes; ++l) {
+      const Index f = lanes.face(b, l);
+      batch.weight[l] = weight[f];
+      const Mat32 D = face_gradient(model, f, shift);
+      const Mat32 C = face_gradient(model, f, center);
+      for (int k = 0; k < 6; ++k) {
+        batch.shift[k][l] = D.data()[k];
+        batch.center[k][l] = C.data()[k];
+      }
+    }
+  }
+  return batches;
 }
 
 }  // namespace diffcloth::elastic

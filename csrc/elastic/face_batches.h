@@ -30,4 +30,15 @@ void put_start_gradients(const Model& model,
                          const std::vector<Index>& faces,
                          std::vector<DampingBatch>& batches);
 
+/// All triangles of a model.
+///
+/// @param shift   d, for the cloths' vertices
+/// @param center  c, likewise
+/// @param weight  [F] stiffnesses times areas [N m]
+std::vector<ChordBatch> chord_batches(const Model& model,
+                                      const Slots& slots,
+                                      const double* shift,
+                                      const double* center,
+                                      const std::vector<double>& weight);
+
 }  // namespace diffcloth::elastic

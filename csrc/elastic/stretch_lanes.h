@@ -41,6 +41,18 @@ struct DampingBatch {
               [kStretchLanes];  ///< F at the start of the step in the same axes, column by column
 };
 
+/// Triangles that a displacement d strains while a step turns them: see chord_strain.h.
+struct ChordBatch {
+  FaceBatch faces;
+  double weight[kStretchLanes];     ///< k A [N m]
+  double shift[6][kStretchLanes];   ///< F(d), column by column
+  double center[6][kStretchLanes];  ///< F(c), likewise
+};
+
+/// q_0 of chord_strain.h, a squared strain: larger than in smooth motion at common time steps, smaller
+/// than a visible strain.
+inline constexpr double kFreeStrainSq = 1e-4;
+
 // NOLINTEND(modernize-avoid-c-arrays)
 
 /// The stretch of many triangles and its damping in lanes.
@@ -128,6 +140,29 @@ struct StretchKernels {
                               bool positive,
                               const std::int32_t* place,
                               double* blocks);
+
+  // Likewise for the resistance to chords, with q = |e|^2:
+  //
+  //   phi(q') - phi(q) = 1/2 (q' - q) (q q' + q_0 (q + q')) / ((q + q_0) (q' + q_0)),
+  //   H_pq = k A [ phi' ((g_p.g_q) D D^T + D g_q (D g_p)^T) + 4 phi'' D e g_p (D e g_q)^T ],   D = F(d).
+
+  double (*chord_energy)(const ChordBatch* batches, std::size_t count, const double* x);
+
+  double (*chord_energy_change)(const ChordBatch* batches,
+                                std::size_t count,
+                                const double* x0,
+                                const double* x1);
+
+  void (*add_chord_gradient)(const ChordBatch* batches,
+                             std::size_t count,
+                             const double* x,
+                             double* g);
+
+  void (*add_chord_hessian)(const ChordBatch* batches,
+                            std::size_t count,
+                            const double* x,
+                            const std::int32_t* place,
+                            double* blocks);
 };
 
 /// @throws std::invalid_argument  if this processor or build has no kernels of that level

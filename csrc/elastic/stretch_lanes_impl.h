@@ -6,6 +6,7 @@
 
 #include <cstddef>
 
+#include "elastic/chord_lanes_impl.h"
 #include "elastic/damping_lanes_impl.h"
 #include "elastic/degenerate.h"
 #include "elastic/face_lanes_impl.h"
@@ -182,7 +183,11 @@ constexpr StretchKernels kKernels{.energy_change = energy_change,
                                   .add_woven_hessian = add_woven_hessian,
                                   .damping_energy_change = damping_energy_change,
                                   .add_damping_gradient = add_damping_gradient,
-                                  .add_damping_hessian = add_damping_hessian};
+                                  .add_damping_hessian = add_damping_hessian,
+                                  .chord_energy = chord_energy,
+                                  .chord_energy_change = chord_energy_change,
+                                  .add_chord_gradient = add_chord_gradient,
+                                  .add_chord_hessian = add_chord_hessian};
 
 }  // namespace
 }  // namespace diffcloth::elastic

@@ -22,6 +22,8 @@
 #include "bind/kernels/potential.h"
 #include "elastic/constant_form.h"
 #include "elastic/elastic_potential.h"
+#include "elastic/elements.h"
+#include "elastic/face_batches.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
@@ -211,6 +213,33 @@ class Elastic {
     change += kernels.damping_energy_change(damped.data(), damped.size(), from.data(), to.data(),
                                             nullptr);
     return nb::make_tuple(change, rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
+  }
+
+  /// Same for the resistance to chords, with all faces and their stretch stiffness.
+  nb::tuple chords(const std::string& level,
+                   const Positions& x0,
+                   const Positions& x1,
+                   const Positions& shift,
+                   const Positions& center) const {
+    const elastic::StretchKernels& kernels = elastic::stretch_kernels(level_named(level));
+    const std::vector<double> from = positions("x0", x0);
+    const std::vector<double> to = positions("x1", x1);
+    std::vector<double> weight;
+    for (Index f = 0; f < elastic::face_count(model_); ++f) {
+      weight.push_back(elastic::stretch_weight(model_, f));
+    }
+    const std::vector<elastic::ChordBatch> batches =
+        elastic::chord_batches(model_, slots_, positions("shift", shift).data(),
+                               positions("center", center).data(), weight);
+    std::vector<double> g(from.size(), 0.0);
+    std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
+    kernels.add_chord_gradient(batches.data(), batches.size(), from.data(), g.data());
+    kernels.add_chord_hessian(batches.data(), batches.size(), from.data(), own_places().data(),
+                              blocks.data());
+    const double change =
+        kernels.chord_energy_change(batches.data(), batches.size(), from.data(), to.data());
+    return nb::make_tuple(change, rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}),
+                          kernels.chord_energy(batches.data(), batches.size(), from.data()));
   }
 
   /// Same for bending that is not flat; the Hessian's blocks exclude their multiples of the identity.
@@ -542,6 +571,8 @@ void elastic_kernels(nb::module_& m) {
            "x_n"_a.noconvert().none())
       .def("stretch", &Elastic::stretch, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "positive"_a = false)
+      .def("chords", &Elastic::chords, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
+           "shift"_a.noconvert(), "center"_a.noconvert())
       .def("bending", &Elastic::bending, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "positive"_a = false)
       .def("extrapolated_hessian", &Elastic::extrapolated_hessian, "x0"_a.noconvert(),
