@@ -1,7 +1,9 @@
 #include "solver/coordinates.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <cstddef>
 #include <limits>
 
 #include "solver/stopping.h"
@@ -11,12 +13,23 @@ namespace {
 
 /// Largest absolute value; NaN counts as infinite.
 double largest(const double* first, const double* last) {
-  double result = 0.0;
-  for (; first != last; ++first) {
-    if (std::isnan(*first)) return std::numeric_limits<double>::infinity();
-    result = std::max(result, std::abs(*first));
+  // Independent lanes, without branches: the loop is as fast as it reads.
+  constexpr std::ptrdiff_t kLanes = 8;
+  std::array<double, kLanes> most{};
+  std::array<double, kLanes> zero{};  // NaN from the first NaN or infinity on
+  const auto add = [&](std::ptrdiff_t lane, double value) {
+    const double size = std::abs(value);
+    most[lane] = size > most[lane] ? size : most[lane];
+    zero[lane] += value * 0.0;
+  };
+  for (; last - first >= kLanes; first += kLanes) {
+    for (std::ptrdiff_t lane = 0; lane < kLanes; ++lane) add(lane, first[lane]);
   }
-  return result;
+  for (std::ptrdiff_t lane = 0; lane < last - first; ++lane) add(lane, first[lane]);
+  for (const double value : zero) {
+    if (std::isnan(value)) return std::numeric_limits<double>::infinity();
+  }
+  return *std::ranges::max_element(most);
 }
 
 }  // namespace
