@@ -32,7 +32,7 @@ def test_gradients_with_a_dynamic_body_and_a_robot(base):
         return (weights * (after.positions - state.positions)).sum() + (body_weights * change).sum()
 
     for name in inputs:
-        assert directional(loss, inputs, [name]) < 1e-5, name
+        assert directional(loss, inputs, [name]) < 1e-6, name
 
 
 def test_an_attachment_to_a_dynamic_body_is_refused():
