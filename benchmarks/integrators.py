@@ -12,7 +12,8 @@ drag       A sheet swings from one edge in air. Error of its positions by the ti
            second-order step with h / 16, and the drag that a fit to these positions finds.
 explicit   The same sheet against an explicit solver of SciPy (DOP853) for the same energies: error
            and processor time by the time step.
-damping    A sheet oscillates about its hanging shape; damping that a fit to data of h / 16 finds.
+damping    A sheet oscillates about its hanging shape; damping that a fit to data of h / 16 finds,
+           by the time step.
 drops      Random sheets fall on bodies and on themselves: the largest energy after contact over the
            energy at the start, speeds at the end, and steps that did not converge.
 cost       Processor time of a step on scenes of `benchmarks.scenes`, second order over Euler.
@@ -51,7 +52,9 @@ def main(parts: Sequence[str], scenes: int, quick: bool) -> None:
         "momentum": lambda: print_momentum(5 if quick else 8, 0.2 if quick else 1.0),
         "drag": lambda: print_drag(4 if quick else 6, 0.2 if quick else 1.2, quick=quick),
         "explicit": lambda: print_explicit(4 if quick else 5, 0.1 if quick else 0.5),
-        "damping": lambda: print_damping(4 if quick else 6, 0.2 if quick else 1.0),
+        "damping": lambda: print_damping(
+            4 if quick else 6, 0.2 if quick else 1.0, (0.01,) if quick else (0.01, 0.005, 0.0025)
+        ),
         "drops": lambda: print_drops(2 if quick else scenes, 0.2 if quick else 1.0),
         "cost": lambda: print_cost((6,) if quick else (12, 24), 2 if quick else 12),
     }
@@ -239,7 +242,7 @@ def errors_and_times(n: int, seconds: float, turns: int = 3) -> list[dict[str, A
     return rows
 
 
-def print_damping(n: int, seconds: float) -> None:
+def print_damping(n: int, seconds: float, steps: Sequence[float]) -> None:
     """Damping that a fit finds in the oscillation of a hanging sheet, at some 11 rad/s."""
 
     def oscillation(h: float, integrator: str, damping: float) -> Tensor:
@@ -259,16 +262,17 @@ def print_damping(n: int, seconds: float) -> None:
 
     finer = oscillation(0.01 / FINE, "second_order", TRUE_DAMPING)
     for integrator in INTEGRATORS:
+        for h in steps:
 
-        def residual(damping: float, integrator: str = integrator) -> float:
-            return rms(oscillation(0.01, integrator, damping), finer) ** 2
+            def residual(damping: float, h: float = h, integrator: str = integrator) -> float:
+                return rms(oscillation(h, integrator, damping), finer) ** 2
 
-        damping = found(residual, 0.0, 2.0 * TRUE_DAMPING)
-        bias = 100 * (damping / TRUE_DAMPING - 1)
-        print(
-            f"{integrator:<16} damping {1e3 * damping:.3f} ms of {1e3 * TRUE_DAMPING:g}, "
-            f"{bias:+.1f} %"
-        )
+            damping = found(residual, 0.0, 2.0 * TRUE_DAMPING)
+            bias = 100 * (damping / TRUE_DAMPING - 1)
+            print(
+                f"{integrator:<16} h {h:<7g} damping {1e3 * damping:.3f} ms of "
+                f"{1e3 * TRUE_DAMPING:g}, {bias:+.1f} %"
+            )
 
 
 def random_drop(seed: int) -> tuple[dc.Scene, float, Tensor]:
