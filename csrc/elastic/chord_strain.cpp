@@ -77,10 +77,8 @@ ChordStrain::ChordStrain(ElasticPotential& elastic, const double* shift, const d
 
 const std::vector<ChordBatch>& ChordStrain::batches() const {
   if (batches_.empty()) {
-    std::vector<double> weight;
-    for (Index f = 0; f < face_count(model_); ++f) {
-      weight.push_back(mean_stiffness(model_, model_, f) * model_.rest->area[f]);
-    }
+    std::vector<double> weight(model_.rest->area);
+    for (Index f = 0; f < face_count(model_); ++f) weight[f] *= mean_stiffness(model_, model_, f);
     batches_ = chord_batches(model_, elastic_.slots(), shift_, center_, weight);
   }
   return batches_;

@@ -224,10 +224,8 @@ class Elastic {
     const elastic::StretchKernels& kernels = elastic::stretch_kernels(level_named(level));
     const std::vector<double> from = positions("x0", x0);
     const std::vector<double> to = positions("x1", x1);
-    std::vector<double> weight;
-    for (Index f = 0; f < elastic::face_count(model_); ++f) {
-      weight.push_back(elastic::stretch_weight(model_, f));
-    }
+    std::vector<double> weight(model_.rest->area);
+    for (Index f = 0; f < elastic::face_count(model_); ++f) weight[f] *= model_.stretch[f];
     const std::vector<elastic::ChordBatch> batches =
         elastic::chord_batches(model_, slots_, positions("shift", shift).data(),
                                positions("center", center).data(), weight);
