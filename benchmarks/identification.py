@@ -264,10 +264,10 @@ def main(
     others: bool,
     changes: tuple[str, ...],
 ) -> None:
+    if others and (configs or changes or comparing or placing):
+        raise click.UsageError("--foreign has scenes of its own: only --seeds and --first")
     torch.set_num_threads(1)
     if others:
-        if configs or changes or comparing or placing:
-            raise click.UsageError("--foreign has scenes of its own: only --seeds and --first")
         for case in foreign.CASES:
             for row in foreign_coverage(case, first, seeds):
                 click.echo(row)

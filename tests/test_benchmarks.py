@@ -174,6 +174,13 @@ def test_intervals_of_fits_to_another_simulator_are_counted(monkeypatch):
     assert rows[5].split() == ["not", "warned", "3", "of", "3"]
 
 
+def test_fits_to_another_simulator_take_no_configuration():
+    main = importlib.import_module("benchmarks.identification").main
+    result = CliRunner().invoke(main, ["--foreign", "--set", "simulation.dt=0.01"])
+    assert result.exit_code == 2
+    assert "--foreign has scenes of its own" in result.output
+
+
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
 def test_white_intervals_are_those_of_a_fit_under_white_noise():
     """A fit of its own to one series, whose robust intervals differ."""
