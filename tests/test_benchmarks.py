@@ -147,7 +147,7 @@ def test_a_fit_is_made_in_all_ways():
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     rows = [line.split()[0] for line in result.stdout.splitlines()[2:]]
-    assert rows == ["euler", "its", "extrapolated", "second_order", "its", "the"]
+    assert rows == ["euler", "its", "extrapolated", "in", "second_order", "its", "the"]
 
 
 def test_intervals_of_fits_to_another_simulator_are_counted(monkeypatch):

@@ -703,6 +703,8 @@ def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]
     stages = list(stages)
     for k, stage in enumerate(stages):
         _check_signature(stage.residuals, space)
+        if stage.tolerance is not None:
+            check_number(f"fit: `residuals[{k}].tolerance`", stage.tolerance, POSITIVE)
         if stage.free is None:
             continue
         if isinstance(stage.free, str) or not stage.free:
