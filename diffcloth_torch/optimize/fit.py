@@ -496,7 +496,8 @@ def fit(
             in SciPy; methods other than "least_squares" accept "linear" only.
         loss_scale: Residual above which a robust loss reduces the weight, > 0.
         max_evaluations: Largest number of evaluations of the residuals in a stage of a start.
-        tolerance: Relative change of the cost or the variables at which a stage ends.
+        tolerance: Relative change of the cost or the variables at which a stage ends, unless the
+            stage has its own.
         covariance: Noise that the intervals assume. "white" assumes independent residuals. "robust"
             accounts for correlation along series, which are the first axis of each tensor, or the
             markers of `residuals.markers`. It uses stretches of the series; if the series are short
