@@ -147,7 +147,50 @@ def test_a_fit_is_made_in_all_ways():
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     rows = [line.split()[0] for line in result.stdout.splitlines()[2:]]
-    assert rows == ["euler", "its", "extrapolated", "second_order", "its", "the"]
+    assert rows == ["euler", "its", "extrapolated", "in", "second_order", "its", "the"]
+
+
+def test_intervals_of_fits_to_another_simulator_are_counted(monkeypatch):
+    """Nine markers in two frames: intervals, moved ones, and their counts in a table."""
+    foreign = importlib.import_module("benchmarks.foreign")
+    monkeypatch.setattr(foreign.example(), "ROWS", 3)
+    case = foreign.Case("few frames", 1, 0.02)
+    one = foreign.outcome(case, 0, frames=2)
+    assert list(one.intervals) == ["white", "white, step", "robust", "robust, step"]
+    for noise in ("white", "robust"):
+        for name in foreign.NUMBERS:
+            still, moved = one.intervals[noise], one.intervals[f"{noise}, step"]
+            assert moved[name][1] - still[name][1] == pytest.approx(moved[name][0] - still[name][0])
+            assert moved[name] != still[name]
+    wide = one._replace(intervals={"white": dict.fromkeys(foreign.NUMBERS, (-1e9, 1e9))})
+    narrow = one._replace(
+        intervals={"white": {n: (t + 1e-9, t + 1) for n, t in one.true.items()}},
+        warned=frozenset({dc.ModelErrorWarning}),
+    )
+    _, warned, *rows = foreign.table(case, [wide, narrow])
+    assert "ModelErrorWarning 1 of 2" in warned
+    assert [row.split()[-4:] for row in rows[1:4]] == [["1", "of", "2", "(9-91%)"]] * 3
+    assert rows[4].split() == ["all", "3", "of", "6"]
+    assert rows[5].split() == ["not", "warned", "3", "of", "3"]
+
+
+def test_fits_to_another_simulator_take_no_configuration():
+    main = importlib.import_module("benchmarks.identification").main
+    result = CliRunner().invoke(main, ["--foreign", "--set", "simulation.dt=0.01"])
+    assert result.exit_code == 2
+    assert "--foreign has scenes of its own" in result.output
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
+def test_white_intervals_are_those_of_a_fit_under_white_noise():
+    """A fit of its own to one series, whose robust intervals differ."""
+    foreign = importlib.import_module("benchmarks.foreign")
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(50))
+    free = {"a": dc.Variable(1.0)}
+    robust = dc.fit(free, lambda p, v: v["a"] - noise, covariance="robust")
+    plain = dc.fit(free, lambda p, v: v["a"] - noise, covariance="white")
+    assert foreign.white(robust)["a"] == pytest.approx(plain.intervals["a"])
+    assert robust.intervals["a"] != pytest.approx(plain.intervals["a"])
 
 
 @pytest.mark.slow

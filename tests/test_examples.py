@@ -178,11 +178,11 @@ def test_fit_friction():
 def test_fit_foreign():
     """Drag, speed and delay of a foreign simulator; the time step alone moves them farther."""
     with pytest.warns(dc.StepBiasWarning, match="speed"):
-        names = runpy.run_path(str(ROOT / "examples/fit_foreign.py"))
-    found = names["limit"]
-    assert found["speed"] == pytest.approx(names["SPEED"], rel=0.04)
-    assert found["delay"] == pytest.approx(names["DELAY"], abs=1e-3)
-    assert found["normal_drag"] == pytest.approx(names["DRAG"], rel=0.04)
+        names = runpy.run_path(str(ROOT / "examples/fit_foreign.py"), run_name="__main__")
+    found, truth = names["limit"], names["truth"]
+    assert found["speed"] == pytest.approx(truth.speed, rel=0.04)
+    assert found["delay"] == pytest.approx(truth.delay, abs=1e-3)
+    assert found["normal_drag"] == pytest.approx(truth.normal_drag, rel=0.04)
     assert names["fit"].rms < 1.2
     assert names["fit"].held_out[0] < 2.0
 

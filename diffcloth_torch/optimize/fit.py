@@ -496,7 +496,8 @@ def fit(
             in SciPy; methods other than "least_squares" accept "linear" only.
         loss_scale: Residual above which a robust loss reduces the weight, > 0.
         max_evaluations: Largest number of evaluations of the residuals in a stage of a start.
-        tolerance: Relative change of the cost or the variables at which a stage ends.
+        tolerance: Relative change of the cost or the variables at which a stage ends, unless the
+            stage has its own.
         covariance: Noise that the intervals assume. "white" assumes independent residuals. "robust"
             accounts for correlation along series, which are the first axis of each tensor, or the
             markers of `residuals.markers`. It uses stretches of the series; if the series are short
@@ -703,6 +704,8 @@ def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]
     stages = list(stages)
     for k, stage in enumerate(stages):
         _check_signature(stage.residuals, space)
+        if stage.tolerance is not None:
+            check_number(f"fit: `residuals[{k}].tolerance`", stage.tolerance, POSITIVE)
         if stage.free is None:
             continue
         if isinstance(stage.free, str) or not stage.free:

@@ -6,7 +6,7 @@ import pickle
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -39,10 +39,13 @@ class Stage:
     Attributes:
         residuals: Function of the residuals, as in `fit`.
         free: Names of the variables that the stage changes; None means all free variables.
+        tolerance: Relative change of the cost or the variables at which the stage ends, > 0; None
+            uses the tolerance of the fit.
     """
 
     residuals: Residuals
     free: Sequence[str] | None = None
+    tolerance: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +144,11 @@ def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]
             report=report,
         )
         problem.history = history
+        tolerance = job.options.tolerance if stage.tolerance is None else stage.tolerance
+        options = replace(job.options, tolerance=tolerance)
         try:
             problem.require(at[rows])
-            end = solve(problem, at[rows], space.low[rows], space.high[rows], job.options)
+            end = solve(problem, at[rows], space.low[rows], space.high[rows], options)
         except FAILURES as error:
             nothing = np.zeros(0)
             return End(

@@ -79,9 +79,9 @@ class Collinear:
     def __str__(self) -> str:
         """Describe the number and the other one."""
         return (
-            f"{self.name} has a standard error of {self.standard_error:.2g}, of "
-            f"{self.error_if_known:.2g} if {self.other} were known "
-            f"(correlation {self.correlation:+.3f})"
+            f"{self.name} has a standard error of {self.standard_error:.2g}, and would have "
+            f"{self.error_if_known:.2g} if all other numbers were known; its largest correlation "
+            f"is {self.correlation:+.3f}, with {self.other}"
         )
 
 
@@ -206,8 +206,7 @@ def uncertainty_of(
     reach = _reach(found.freedom)
     half_widths = reach * errors
     correlation = _correlation(covariance, deviations)
-    with np.errstate(divide="ignore"):
-        alone = noise / np.linalg.norm(np.vstack([jacobian * units, priors * noise]), axis=0)
+    alone = _alone(jacobian * units, priors * scale, noise, spread)
     return Uncertainty(
         covariance=covariance,
         correlation=correlation,
@@ -230,6 +229,21 @@ def _inverse_root(middle: FloatArray) -> FloatArray:
     sizes, directions = np.linalg.eigh(middle)
     root: FloatArray = (directions / np.sqrt(np.maximum(sizes, _TINY))).T
     return root
+
+
+def _alone(
+    jacobian: FloatArray, priors: FloatArray, noise: float, spread: Spread | None
+) -> FloatArray:
+    """Standard error of each number if all others were known [p], with the noise of the fit."""
+    sizes = np.linalg.norm(np.vstack([jacobian, priors]), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if spread is None:
+            return np.asarray(noise / sizes)
+        columns, known = jacobian / sizes, np.square(priors / sizes).sum(axis=0)
+        middle = [spread(columns[:, [i]])[0, 0] + known[i] for i in np.flatnonzero(sizes)]
+    errors = np.full(len(sizes), np.inf)
+    errors[sizes > 0] = np.sqrt(middle) / sizes[sizes > 0]
+    return errors
 
 
 def _collinear(

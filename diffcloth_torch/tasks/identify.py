@@ -40,6 +40,9 @@ __all__ = ["Identify", "Observations"]
 
 _VELOCITY = "velocity"  # initial velocity of all vertices without pins; not a parameter
 _LARGEST_OBSERVATION = 256 << 20  # bytes of a file: one hour of video with a hundred markers
+# Smallest tolerance of extrapolated fits, whose evaluations are expensive: a last step of at most
+# .3 standard errors, with a thousand residuals.
+_ROUGH = 1e-4
 _SAME_POINT = 1e-6  # largest distance of vertices of two meshes at one material point, over size
 
 
@@ -88,7 +91,9 @@ class Identify(ConfiguredTask):
         """The residuals of `fit`; with `extrapolate` its stages, the first without."""
         if not self._fit.extrapolate:
             return self.observed
-        return [Stage(self.observed), Stage(self._extrapolated(self.observed))]
+        tolerance = max(self._fit.tolerance, _ROUGH)
+        extrapolated = self._extrapolated(self.observed)
+        return [Stage(self.observed, tolerance=tolerance), Stage(extrapolated, tolerance=tolerance)]
 
     def hold_out(self) -> Residuals | None:
         """The residuals of trajectories that are kept out of the fit."""

@@ -113,6 +113,17 @@ def test_a_start_that_fails_says_so():
     assert all("failed at its first values: step: of a test" in start.apart for start in failed)
 
 
+def test_a_stage_ends_at_its_own_tolerance():
+    exact = dc.fit(VARIABLES, residuals)
+    stages = [dc.Stage(residuals, tolerance=0.5), dc.Stage(residuals)]
+    found = dc.fit(VARIABLES, stages)
+    evaluations = [sum(trial.stage == k for trial in found.history) for k in range(2)]
+    assert 1 < evaluations[0] < len(exact.history) - 2
+    assert found.cost == pytest.approx(exact.cost, rel=1e-8)
+    with pytest.raises(dc.InvalidInput, match=r"`residuals\[1\].tolerance` must be"):
+        dc.fit(VARIABLES, [stages[1], dc.Stage(residuals, tolerance=0.0)])
+
+
 def test_a_stage_keeps_what_it_does_not_free_and_the_next_begins_there():
     seen = []
 

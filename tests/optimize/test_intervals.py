@@ -234,9 +234,22 @@ def test_nearly_collinear_numbers_are_named():
     assert pair.correlation < -0.99
     assert pair.standard_error == pytest.approx(0.3 / 2**0.5, rel=0.3)
     assert pair.error_if_known < 0.01
-    assert f"if {pair.other} were known (correlation -1.000)" in str(pair)
+    text = f"if all other numbers were known; its largest correlation is -1.000, with {pair.other}"
+    assert text in str(pair)
     known = dc.fit(free | {"squeeze": dc.Variable(2.5, free=False)}, residuals)
     assert known.collinear == []
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.ModelErrorWarning")
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
+def test_correlated_noise_makes_no_number_collinear():
+    """The error with known others has the covariance of the fit: one number has no others."""
+    noise = torch.from_numpy(np.random.default_rng(5).standard_normal(400).cumsum())
+    found = dc.fit({"a": dc.Variable(1.0)}, lambda p, v: v["a"] - noise, covariance="robust")
+    plain = dc.fit({"a": dc.Variable(1.0)}, lambda p, v: v["a"] - noise, covariance="white")
+    assert found.noise_model == "random walks"
+    assert found.covariance[0, 0] > 100 * plain.covariance[0, 0]
+    assert found.collinear == []
 
 
 def test_another_covariance_is_refused():

@@ -195,6 +195,10 @@ def test_extrapolated_configurations_are_fitted_without_the_bias(config):
     task = load_task(config, [*FALL, "fit.extrapolate=true"])
     found = dc.fit(task.variables(), task.residuals(), **task.options())
     assert float(found.values["normal_drag"]) == pytest.approx(2.0, rel=0.05)
+    exact = dc.fit({"normal_drag": dc.Variable(2.0)}, task.residuals()[-1].residuals)
+    low, high = exact.intervals["normal_drag"]
+    away = float(found.values["normal_drag"] - exact.values["normal_drag"])
+    assert abs(away) < 0.1 * (high - low) / 2, "the rough tolerance of extrapolated stages"
     assert not task.checks_step
     assert load_task(config, FALL).checks_step
     assert not load_task(config, [*FALL, "fit.step_check=false"]).checks_step
