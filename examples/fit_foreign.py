@@ -10,6 +10,7 @@ numbers are the stretch stiffness, the drag, the speed at the start, and the del
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -151,8 +152,12 @@ fit = dc.fit(
 print(fit)
 print(f"true: drag {DRAG}, speed {SPEED}, delay {DELAY}")
 print(f"the last {FRAMES - kept} frames, kept out: rms {fit.held_out[0]:.3g}")
-shift = fit.step_bias(compare(0.005, slice(0, kept)), order=2)
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", dc.StepBiasWarning)  # the numbers are printed below
+    shift = fit.step_bias(compare(0.005, slice(0, kept)), order=2)
 limit = {name: float(fit.values[name] + moved) for name, moved in shift.items()}
-print("without the error of the time step:", {name: round(x, 4) for name, x in limit.items()})
+print("without the error of the time step:")
+for name, number in limit.items():
+    print(f"  {name} {number:.4g}")
 low = fit.predict(lambda p, v: swing(0.01, p, v)[-1].positions[:, 2].min())
 print(f"lowest point at the end: {low.value:.4f} +- {low.half_width:.4f} m")
