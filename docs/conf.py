@@ -35,7 +35,13 @@ extensions = [
     "sphinx_design",
 ]
 root_doc = "README"
-include_patterns = ["*.md", "docs/**", "csrc/*/README.md", "diffcloth_torch/*/README.md"]
+include_patterns = [
+    "*.md",
+    "changelog.d/README.md",
+    "docs/**",
+    "csrc/*/README.md",
+    "diffcloth_torch/*/README.md",
+]
 exclude_patterns = [".*", "build", "results"]
 
 html_theme = "furo"
@@ -57,6 +63,8 @@ nb_merge_streams = True
 # Pages of examples run them by their names.
 os.environ["PYTHONPATH"] = str(ROOT / "examples")
 os.environ["TQDM_DISABLE"] = "1"
+# A requirement of pyvista imports bars of notebooks, which miss ipywidgets.
+os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"
 # What `scripts/replays` makes for the gallery is served as it is.
 EXTRA = ROOT / "build" / "extra"
 EXTRA.mkdir(parents=True, exist_ok=True)
@@ -68,6 +76,8 @@ autodoc_member_order = "bysource"
 autoclass_content = "both"
 autodoc_default_options = {"members": True}
 autodoc_typehints_format = "short"
+# By its name: the union of NumPy has eight members.
+autodoc_type_aliases = {"ArrayLike": "ArrayLike", "ByName": "ArrayLike | Mapping[str, float]"}
 autosummary_generate = False
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 88
@@ -118,7 +128,7 @@ CONTENTS = {
     ),
     "Development": (
         "Extend the package, contribute, read what was tried.",
-        ["docs/extending", "CONTRIBUTING", "docs/notes/index"],
+        ["docs/extending", "CONTRIBUTING", "changelog.d/README", "docs/notes/index"],
     ),
 }
 PICTURE_OF_A_COMMAND = re.compile(
@@ -159,7 +169,8 @@ def add_contents(app, name, source):
             cards += CARD.format(caption=caption, page=pages[0], text=text)
             contents += TOCTREE.format(caption=caption, pages="\n".join(pages))
         head, heading, body = source[0].partition("\n## ")
-        source[0] = f"{head}\n::::{{grid}} 1 2 3 4\n{cards}::::\n{heading}{body}{contents}"
+        grid = f"::::{{grid}} 1 2 3 4\n:gutter: 2\n\n{cards}::::\n"
+        source[0] = f"{head}\n{grid}{heading}{body}{contents}"
     elif source[0].startswith("---\nfile_format: mystnb"):
         head, title, text = re.split(r"^(# .+\n)", source[0], maxsplit=1, flags=re.MULTILINE)
         # A kernel tells the language of its cells; where none runs, nothing else does.
@@ -198,10 +209,12 @@ INTERNAL = {
 
 
 def shorten_signature(app, what, name, thing, options, signature, returns):
-    """Leave out fields of dataclasses that begin with an underscore, and what no user calls."""
+    """Leave out private fields of dataclasses and private constructors; print aliases by name."""
     if name in MADE_INSIDE:
         return "", None
-    return re.sub(r", _\w+: [^,()]*(?=[,)])", "", signature or "") or None, returns
+    text = re.sub(r", _\w+: [^,()]*(?=[,)])", "", signature or "")
+    # In unions Sphinx prints an alias as the class that it has for aliases.
+    return re.sub(r"TypeAliasForwardRef\('([^']*)'\)", r"\1", text) or None, returns
 
 
 def leave_out_internal(app, what, name, thing, options, lines):

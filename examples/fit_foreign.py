@@ -10,6 +10,7 @@ numbers are the stretch stiffness, the drag, the speed at the start, and the del
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -195,8 +196,12 @@ if __name__ == "__main__":
     print(fit)
     print(f"true: drag {truth.normal_drag}, speed {truth.speed}, delay {truth.delay}")
     print(f"the last {FRAMES - KEPT} frames, kept out: rms {fit.held_out[0]:.3g}")
-    shift = fit.step_bias(compare(recorded, 0.005, fitted), order=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.StepBiasWarning)  # the numbers are printed below
+        shift = fit.step_bias(compare(recorded, 0.005, fitted), order=2)
     limit = {name: float(fit.values[name] + moved) for name, moved in shift.items()}
-    print("without the error of the time step:", {name: round(x, 4) for name, x in limit.items()})
+    print("without the error of the time step:")
+    for name, number in limit.items():
+        print(f"  {name} {number:.4g}")
     low = fit.predict(lambda p, v: swing(0.01, clock[-1], p, v)[-1].positions[:, 2].min())
     print(f"lowest point at the end: {low.value:.4f} +- {low.half_width:.4f} m")

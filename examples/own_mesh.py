@@ -31,4 +31,4 @@ end = states[-1]
 loss = (end.positions - start.positions)[:, 0].mean()  # how far it got [m]
 loss.backward()
 print(f"{end.report.contact_count} contacts, {loss.item():.4f} m")
-print(f"gradient: throw {throw.grad.tolist()}, friction {friction.grad.item():.6f}")
+print(f"gradient: throw {throw.grad[0].item():.4f}, friction {friction.grad.item():.4f}")

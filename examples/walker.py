@@ -71,6 +71,7 @@ cloth = states[-1].positions[simulator.slices["sheet"]]
 mean = cloth.mean(dim=0)
 mean[0].backward()
 contact = states[-1].report.contacts["walker", "sheet"]
-print(f"after {float(states[-1].time):.2f} s the sheet is at {mean.tolist()} m")
+x, y, z = mean.tolist()
+print(f"after {float(states[-1].time):.2f} s the sheet is at ({x:.3f}, {y:.3f}, {z:.3f}) m")
 print(f"{contact.count} contacts, {contact.force[2]:.3f} N upwards")
-print(f"its place along the way by the stride: {stride.grad.item():.6f} m/rad")
+print(f"gradient of its x by the stride: {stride.grad.item():.6f} m/rad")

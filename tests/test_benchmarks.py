@@ -70,7 +70,7 @@ def test_scenes_are_in_their_regimes(quick):
             assert share == 1
 
 
-def test_threads_do_not_change_what_is_solved(quick):
+def test_threads_do_not_change_solutions(quick):
     _, records = quick
     for scene in {timing["scene"] for timing in records["timings"]}:
         one, two = (t for t in records["timings"] if t["scene"] == scene and t["batch"] > 0)
@@ -79,7 +79,7 @@ def test_threads_do_not_change_what_is_solved(quick):
             assert one[field] == two[field]
 
 
-def test_summaries(quick):
+def test_summaries_have_a_finite_row_for_each_scene(quick):
     _, records = quick
     for summary in ("exponents", "batch_scaling"):
         assert len(records[summary]) == SCENES
@@ -219,7 +219,7 @@ def run_figures(*arguments):
 
 
 @pytest.mark.slow
-def test_the_page_of_figures_has_what_was_measured(figures):
+def test_the_page_of_figures_has_the_measurements(figures):
     records = json.loads((figures / "performance.json").read_text())
     page = (figures / "performance.md").read_text()
     rows = records["releases"]["an equal"]

@@ -152,13 +152,13 @@ class TestDisk:
         assert file.read_bytes() == data
         assert [f.name for f in file.parent.iterdir()] == ["file.pt"]
 
-    def test_full(self, file, full):
+    def test_a_full_disk_keeps_the_older_file(self, file, full):
         data = file.read_bytes()
         with pytest.raises(OSError, match=r"file\.pt cannot be written: File too large"):
             write_checkpoint(file, "thing", CONTENT)
         self.assert_kept(file, data)
 
-    def test_read_only(self, read_only):
+    def test_a_read_only_folder_keeps_the_older_file(self, read_only):
         data = read_only.read_bytes()
         with pytest.raises(PermissionError, match=r"file\.pt cannot be written: Permission denied"):
             write_checkpoint(read_only, "thing", CONTENT)

@@ -177,7 +177,7 @@ def test_a_missing_configuration_ends_with_2(call):
     assert one_sentence(result) == "Error: nowhere.yaml: there is no such file"
 
 
-def test_a_failed_simulation_ends_with_1_and_keeps_what_there_is(call, tmp_path, monkeypatch):
+def test_a_failed_simulation_ends_with_1_and_keeps_its_results(call, tmp_path, monkeypatch):
     real = Simulator.step
     taken = []
 
@@ -202,7 +202,7 @@ def test_debug_shows_the_error_itself(call):
     assert isinstance(result.exception, dc.InvalidInput)
 
 
-def test_info_names_what_was_built(call):
+def test_info_names_the_build(call):
     result = call("info")
     assert result.exit_code == 0
     assert "drape, hit_cloth" in result.output
@@ -466,7 +466,7 @@ def test_a_folder_that_cannot_be_made_is_refused(call, tmp_path, out):
     assert "cannot be written" in result.stderr or "is a file" in result.stderr
 
 
-def test_a_full_disk_ends_in_a_sentence_and_keeps_what_there_was(call, tmp_path):
+def test_a_full_disk_ends_in_a_sentence_and_keeps_older_files(call, tmp_path):
     arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--set=output.viewers=[]"]
     assert call("optimize", *arguments, "--out", "out").exit_code == 0
     before = {f.name: f.read_bytes() for f in (tmp_path / "out").iterdir()}

@@ -83,7 +83,7 @@ def test_towers_are_of_every_kind():
     assert again.description == scenes[7].description
 
 
-def test_the_fuzz_sees_what_is_wrong():
+def test_the_fuzz_finds_planted_faults():
     """Judges are useful only if they detect errors."""
     scene = next(s for s in (draw_tower(1, i) for i in range(60)) if s.drives is not None)
     tally = fuzz_main.Tally(show_failures=False)

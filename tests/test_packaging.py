@@ -90,7 +90,7 @@ print(end.report.converged, bool(torch.isfinite(positions.grad).all()))
     assert printed(code) == "True True"
 
 
-def test_sources_without_a_core_say_what_to_do(tmp_path):
+def test_sources_without_a_core_name_the_remedy(tmp_path):
     sources = tmp_path / "diffcloth_torch"
     shutil.copytree(
         Path(diffcloth_torch.__file__).parent,

@@ -70,7 +70,7 @@ def test_parameters_say_numbers_and_shapes(simulator):
     assert repr(dc.Parameters()) == "Parameters()"
 
 
-def test_a_control_says_what_is_set(simulator):
+def test_a_control_shows_its_set_fields(simulator):
     assert repr(dc.Control()) == "Control()"
     named = dc.Control(pins={"sheet/edge": torch.zeros(24, 3)}, joint_efforts=[0.5, 1.0])
     assert repr(named) == "Control(pins={'sheet/edge': float32[24, 3]}, joint_efforts=[0.5, 1.0])"
@@ -103,7 +103,7 @@ def test_a_report_says_its_numbers(state):
     assert "sticking" not in text  # never happened
 
 
-def test_a_report_of_a_batch_says_what_its_numbers_range_over(simulator):
+def test_a_report_of_a_batch_shows_the_range_of_its_numbers(simulator):
     falling = simulator.initial_state(2)
     velocities = falling.velocities.clone()
     velocities[1] += 0.1 * torch.randn(velocities[1].shape, generator=torch.Generator(), dtype=F64)

@@ -111,7 +111,7 @@ def test_a_policy_names_the_axes_that_it_has_learned_in(tmp_path):
 
 
 class TestTraining:
-    def test_goes_on(self, files):
+    def test_a_training_continues(self, files):
         folder = files / "train"
         kept = read_json(folder / "train.json")["evaluations"]
         assert [each["updates"] for each in kept] == [0, 1]
@@ -123,7 +123,7 @@ class TestTraining:
         assert found["config"]["trainer"]["learning_rate"] == 0.004
         assert "nothing is left to do" in resume("train", folder).output  # now in today's format
 
-    def test_begins_where_no_policy_was_kept(self, files):
+    def test_a_training_without_a_policy_begins_anew(self, files):
         folder = files / "train"
         (folder / "policy.pt").unlink()
         result = resume("train", folder)
@@ -131,7 +131,7 @@ class TestTraining:
         found = read_json(folder / "train.json")["evaluations"]
         assert [each["updates"] for each in found] == [0, 1, 2]
 
-    def test_of_a_task_with_other_observations_is_refused(self, files):
+    def test_a_policy_of_a_task_with_other_observations_is_refused(self, files):
         folder = files / "train"
         (files / "fold.pt").replace(folder / "policy.pt")
         document = read_json(folder / "resume.json")
@@ -146,7 +146,7 @@ class TestTraining:
 
 
 class TestFit:
-    def test_goes_on_with_the_evaluations_that_were_kept(self, files):
+    def test_a_fit_continues_with_its_evaluations(self, files):
         kept = torch.load(files / "fit" / "evaluations" / "start_0.pt", weights_only=True)
         seconds = [r["seconds"] for r in kept["records"] if r["kind"] == "residuals"]
         result = resume("fit", files / "fit")
@@ -157,7 +157,7 @@ class TestFit:
         assert len(found) > len(seconds)
         assert resume("fit", files / "fit").exit_code == 0  # now in today's format
 
-    def test_is_refused_where_the_simulation_differs(self, files):
+    def test_a_fit_of_another_simulation_is_refused(self, files):
         def differ(content):
             content["records"][0]["found"][0] += 1e-9
 

@@ -191,8 +191,8 @@ def descend(
         resume: Results reported by an earlier loop, to continue that loop. Variables, optimizer and
             generator are set to their states in `resume`; the result has the same bits as without
             the interruption.
-        generator: Generator from which `simulate` and `loss` draw random numbers; torch's own by
-            default.
+        generator: Generator from which `simulate` and `loss` draw random numbers, seeded by the
+            caller; torch's own by default. The loop itself draws none.
         bar: Progress bar of the caller.
 
     Returns:

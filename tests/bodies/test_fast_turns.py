@@ -52,7 +52,7 @@ def contact_steps(size, turn, seed, steps):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_contact_gives_no_energy_to_what_turns_by_a_tenth_of_a_radian(size):
+def test_contact_adds_no_energy_to_bodies_that_turn_a_tenth_of_a_radian(size):
     touched = 0
     for seed in range(6):
         for sim, before, after in contact_steps(size, 0.1, seed, 20):
@@ -181,7 +181,7 @@ def rolling(turn):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_contact_seldom_gives_energy_to_what_turns_by_less_than_a_radian(size):
+def test_contact_seldom_adds_energy_to_bodies_that_turn_less_than_a_radian(size):
     """Counted as in `python -m benchmarks.turns`; sticks once gained eight times their energy."""
     rises = []
     for turn in (0.3, 0.6):
@@ -244,7 +244,7 @@ def test_the_environment_that_turns_too_fast_is_named():
     assert error.value.environments == (1,)
 
 
-def test_the_environments_of_what_turns_too_far_by_itself_are_named():
+def test_environments_of_bodies_that_turn_too_far_are_named():
     """The message names the first such body of the first such environment."""
     boxes = [
         dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, pose=[k, 0, 0, 1, 0, 0, 0], name=name)

@@ -156,7 +156,7 @@ def test_a_gradient_by_values_that_move_no_joint_is_refused(actuation):
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_gradients_reach_what_was_given_and_what_is_held(layout, scene, named):
+def test_gradients_reach_set_and_held_joints(layout, scene, named):
     given = torch.tensor([0.1, 0.4, 0.0, 0.0, 0.0], dtype=torch.float32, requires_grad=True)
     targets = {"slide": given[0], "turn": given[1]} if named else given
     state, size = state_fields(layout, make_state(scene))

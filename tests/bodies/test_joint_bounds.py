@@ -86,7 +86,7 @@ def test_a_joint_sticks_below_its_friction_but_for_the_creep_of_slip(tmp_path, s
 
 
 @pytest.mark.parametrize("effort", [0.9, -2.0])
-def test_a_joint_slips_under_what_is_beyond_its_friction(tmp_path, effort):
+def test_a_joint_slips_under_efforts_beyond_its_friction(tmp_path, effort):
     robot = dc.Robot.load(arm_file(tmp_path, friction=0.6), actuation="torque")
     end = rolled(simulator(robot, gravity=(0, 0, 0)), 20, joint_efforts=tensor(effort))[-1]
     speed = 20 * H * (effort - np.sign(effort) * 0.6) / INERTIA

@@ -261,7 +261,7 @@ def test_a_fingertip_presses_cloth_as_a_kinematic_ball_does(tmp_path, scheme):
     )
 
 
-def test_efforts_hold_what_the_fingertip_carries(tmp_path):
+def test_efforts_hold_the_load_of_the_fingertip(tmp_path):
     """The moment of the contact force and of the weight about the hinge, by statics."""
     robot = finger(tmp_path, actuation="position", friction=0.5)
     sim = dc.Simulator(dc.Scene([sheet()], robots=[robot]), 0.01, contact=BARRIER, solver=TIGHT)

@@ -356,7 +356,7 @@ def box_scene(**options):
     return dc.Scene([dc.Cloth.grid(3, 3)], [box], **options)
 
 
-def test_split_takes_what_forces_move_only_when_staggered():
+def test_split_accepts_dynamic_bodies_only_when_staggered():
     with pytest.raises(dc.InvalidInput, match="'split' takes prescribed bodies and the staggered"):
         dc.Simulator(box_scene(), DT, scheme="split")
     with pytest.raises(dc.InvalidInput, match="'rigid_to_cloth', 'cloth_to_rigid', got 'both'"):

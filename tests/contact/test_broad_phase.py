@@ -476,7 +476,7 @@ def test_a_single_triangle_has_no_elements_apart():
 
 
 @pytest.mark.parametrize("level", kernels.kernel_levels())
-def test_near_boxes(level):
+def test_near_boxes_are_found_by_their_euclidean_distance(level):
     """Boxes with margins that sum to the range; inner boxes are near by Euclidean distance."""
     rng = np.random.default_rng(5)
     found = 0

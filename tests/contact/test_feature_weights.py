@@ -322,7 +322,7 @@ def test_pinned_faces_of_a_cloth_bear_only_moving_points():
     assert all(counts)
 
 
-def test_a_thick_body_costs_what_a_thin_one_does():
+def test_a_thick_body_costs_as_much_as_a_thin_one():
     """One sheet at one gap has the same number of candidates and contacts, also in the cloth."""
     rng = np.random.default_rng(6)
     X, faces = contact_scenes.grid(20, 1.0, rng)

@@ -144,7 +144,7 @@ def test_the_last_places_are_where_the_velocities_come_from(world):
     assert torch.equal(last["joint_positions"], joints)
 
 
-def test_the_last_places_of_what_is_prescribed_are_those_of_the_start():
+def test_last_places_of_prescribed_joints_equal_the_start():
     scene = make_scene(actuation=("position", "pd"), base="fixed")
     assembly = assemble(scene)
     dynamics = Dynamics(assembly, H)

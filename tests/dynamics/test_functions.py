@@ -287,7 +287,7 @@ def test_the_same_bits_on_several_threads():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.0999999, 0.1000001, 1.0, 3.0, math.pi - 1e-6])
-def test_rotations(angle):
+def test_rotations_agree_with_torch(angle):
     """Against torch, and the work of a moment against the derivative of the rotation."""
     axis, moment = tensor([2.0, -1.0, 2.0]) / 3, tensor([0.3, 1.0, -0.5])
     w = angle * axis

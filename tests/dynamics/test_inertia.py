@@ -62,7 +62,7 @@ def own_rows(judge, values):
     return values if judge.free else values[..., 6:]
 
 
-def test_frames(judge):
+def test_frames_agree_with_pinocchio(judge):
     pose, joints, _, q, _, _ = state(judge)
     got = motion_at(judge, pose, joints).frames.poses[0].numpy()
     pin.forwardKinematics(judge.model, judge.data, q)
@@ -71,7 +71,7 @@ def test_frames(judge):
         np.testing.assert_allclose(got[l], expected, **CLOSE)
 
 
-def test_mass_matrix(judge):
+def test_the_mass_matrix_agrees_with_pinocchio(judge):
     pose, joints, _, q, _, C = state(judge)
     got = mass_matrix(motion_at(judge, pose, joints), inertia_of(judge.mechanism))[0].numpy()
     got = own_rows(judge, own_rows(judge, got).T).T
@@ -110,7 +110,7 @@ def bias(judge, pose, joints, nu):
     return rate - slope(judge.tree, motion, nu) - generalized_force(motion, weights)
 
 
-def test_bias(judge):
+def test_the_bias_agrees_with_pinocchio(judge):
     """Velocity products and gravity, from the rate of the momentum and the slope."""
     pose, joints, nu, q, v, C = state(judge)
     judge.model.gravity.linear = G

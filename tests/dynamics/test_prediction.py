@@ -66,7 +66,7 @@ def test_a_tumbling_body_keeps_momentum_and_energy(rate):
     assert (energy / energy[0] - 1).abs().max() < 1e-3 * max(1.0, (rate / 10) ** 2) / 2
 
 
-def test_free_fall():
+def test_a_body_falls_as_implicit_euler():
     flight = fly(AT_ORIGIN[None], tensor([[[0.3, 0, 1.0, 0, 0, 0]]]), 50)
     pose, velocity, _ = flight[-1]
     n = 50

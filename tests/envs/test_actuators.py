@@ -26,7 +26,7 @@ def action(moves, grasp):
 
 
 class TestPickers:
-    def test_move_in_equal_parts_and_stay_above_the_floor(self):
+    def test_pickers_move_in_equal_parts_and_stay_above_the_floor(self):
         pickers = Pickers(SHEET, 1, **PULL)
         start = pickers.start(at([0.5, 0.5, 0.06]))
         controls, tools = pickers.act(start, STATE, action((1.0, -0.5, -1.0), 0.0), 4)
@@ -39,7 +39,7 @@ class TestPickers:
             assert not control.attachment_weights["picker_0"].any()
 
     @pytest.mark.parametrize(("distance", "holds"), [(0.029, True), (0.031, False)])
-    def test_close_on_what_is_within_reach(self, distance, holds):
+    def test_pickers_close_on_vertices_within_reach(self, distance, holds):
         pickers = Pickers(SHEET, 1, **PULL)
         start = pickers.start(at(CORNER + torch.tensor([0.0, 0.0, distance], dtype=F64)))
         controls, tools = pickers.act(start, STATE, action((0, 0, 0), 0.5), 1)
@@ -49,7 +49,7 @@ class TestPickers:
         if holds:  # the target starts at the vertex, so the vertex does not jump
             torch.testing.assert_close(controls[0].attachments["picker_0"][0, 0], CORNER)
 
-    def test_hold_what_they_have_until_they_open(self):
+    def test_pickers_hold_their_vertices_until_they_open(self):
         pickers = Pickers(SHEET, 1, **PULL)
         _, tools = pickers.act(pickers.start(at(CORNER)), STATE, action((0, 0, 0), 1.0), 1)
         # Beside another vertex the picker keeps its vertex, at the same distance.

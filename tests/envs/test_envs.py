@@ -301,7 +301,7 @@ def test_a_kept_state_goes_on_with_the_same_bits():
         (lambda: begun().reset(seed=[1, -1]), r"`seed\[1\]` must be at least 0, got -1"),
     ],
 )
-def test_bad_input(call, message):
+def test_bad_arguments_are_refused(call, message):
     with pytest.raises(dc.InvalidInput, match=message):
         call()
 

@@ -60,6 +60,6 @@ def test_other_fields_are_left_out_and_points_that_are_not_finite():
         (header("ascii").replace(b"TYPE", b"KIND"), "must have the line TYPE"),
     ],
 )
-def test_bad_files(content, message):
+def test_bad_files_are_refused(content, message):
     with pytest.raises(dc.InvalidInput, match=message):
         read_pcd(Path("a.pcd"), content)

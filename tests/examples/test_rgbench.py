@@ -212,6 +212,6 @@ def test_bad_captures_are_refused(recorded, tmp_path, file, content, message):
         ),
     ],
 )
-def test_bad_input(recorded, call, message):
+def test_bad_arguments_are_refused(recorded, call, message):
     with pytest.raises(dc.InvalidInput, match=message):
         call(recorded)

@@ -236,7 +236,7 @@ def test_a_bad_cloth_is_refused(changes, error, message):
         square(**changes)
 
 
-def test_a_cloth_copies_what_it_is_given():
+def test_a_cloth_copies_its_arguments():
     vertices = VERTICES[:4].copy()
     cloth = square(vertices=vertices)
     vertices[0] = 99

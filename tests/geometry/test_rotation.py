@@ -25,7 +25,7 @@ ANGLES = [0.0, 1e-9, 1e-3, 0.0999999, 0.1000001, 1.0, 3.0, math.pi - 1e-6]
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exponential(angle):
+def test_the_exponential_agrees_with_rodrigues(angle):
     K = torch.linalg.cross(AXIS.expand(3, 3), torch.eye(3, dtype=F64)).T
     expected = torch.eye(3, dtype=F64) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
     torch.testing.assert_close(rotation_exp(angle * AXIS), expected, rtol=0, atol=1e-15)

@@ -95,7 +95,7 @@ def test_second_derivatives_are_refused(coupled, loss):
 # --- Which gradients -----------------------------------------------------------------------------
 
 
-def test_only_what_is_needed_is_computed(coupled, monkeypatch):
+def test_only_required_gradients_are_computed(coupled, monkeypatch):
     asked = []
     core = coupled.sim._core
 
@@ -228,7 +228,7 @@ def batch_gradients(case):
     return after, dict(zip([*own, *shared], found, strict=True))
 
 
-def test_a_batch_has_the_bits_of_its_environments_and_sums_what_they_share(case):
+def test_a_batch_has_the_bits_of_its_environments_and_sums_shared_inputs(case):
     after, found = batch_gradients(case)
     sums = {}
     for i, state in enumerate(three_states(case)):

@@ -72,7 +72,7 @@ def check_gradients(run, inputs, directions, state):
 
 
 @pytest.mark.parametrize(("package", "name"), ROBOTS)
-def test_gradients_through_what_a_robot_carries(package, name):
+def test_gradients_through_the_load_of_a_robot_agree_with_differences(package, name):
     """Gradients by joint targets, base pose and friction, over four steps in contact."""
     path = robot_file(package, name)
     robot, span = inside_its_limits(path, base="kinematic", actuation="position")

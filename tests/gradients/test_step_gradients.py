@@ -148,7 +148,7 @@ def _matrix(pose):
     return result
 
 
-def test_sticking_and_sliding_are_what_they_say():
+def test_regimes_stick_and_slide_as_named():
     case = scenes.regime("sticking")
     after = case.step()
     slip = contact_slip(case, after)

@@ -83,7 +83,7 @@ PROJECTIVE = ("hanging", "pinned")
 
 
 @pytest.mark.parametrize("name", scenes.REGIMES)
-def test_steps(name):
+def test_tangents_of_steps_agree_with_gradients(name):
     check_case(scenes.regime(name))
 
 
@@ -94,12 +94,12 @@ def test_steps_in_two_stages(name, metric):
 
 
 @pytest.mark.parametrize("name", PROJECTIVE)
-def test_projective_steps(name):
+def test_tangents_of_projective_steps_agree_with_gradients(name):
     check_case(scenes.regime(name, "projective"))
 
 
 @pytest.mark.parametrize("make", [attachments.picked, attachments.sewn, attachments.held])
-def test_attachments(make):
+def test_tangents_by_attachments_agree_with_gradients(make):
     check_case(make(**attachments.SCHEMES["coupled"]))
 
 

@@ -20,7 +20,7 @@ def act(observation):
     return torch.full((1, 8), 0.3) + 0.1 * observation[:, :8].sin()
 
 
-def test_minari_reads_what_replays(tmp_path, monkeypatch):
+def test_minari_reads_recorded_episodes(tmp_path, monkeypatch):
     """Nine episodes in two chunks; the simulation of the second episode fails in step 3."""
     minari = pytest.importorskip("minari", reason="minari is in the extra `data`")
     pytest.importorskip("h5py", reason="h5py is in the extra `data`")
@@ -63,7 +63,7 @@ def test_minari_reads_what_replays(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["demos"]
 
 
-def test_an_interruption_leaves_nothing(tmp_path):
+def test_an_interrupted_recording_leaves_no_files(tmp_path):
     pytest.importorskip("minari", reason="minari is in the extra `data`")
     pytest.importorskip("h5py", reason="h5py is in the extra `data`")
     calls = []
@@ -80,7 +80,7 @@ def test_an_interruption_leaves_nothing(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["demos"]
 
 
-def test_refusals(tmp_path, monkeypatch):
+def test_record_refuses_bad_arguments(tmp_path, monkeypatch):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     for path, message in (

@@ -51,7 +51,7 @@ def first(episodes, count):
 
 
 class TestEpisodes:
-    def test_are_the_same_whatever_their_number_and_chunk(self, policy, monkeypatch):
+    def test_an_episode_does_not_depend_on_their_number_and_chunk(self, policy, monkeypatch):
         many = evaluate(make, policy, 5, 3)
         assert len(many) == 5
         assert many.steps == 5 * 4
@@ -63,14 +63,14 @@ class TestEpisodes:
             assert_same_episodes(found, first(many, count))
             assert found.seeds == many.seeds[:count]
 
-    def test_have_actions_that_do_not_depend_on_others(self, policy):
+    def test_actions_do_not_depend_on_other_episodes(self, policy):
         """Rounding of matrix products depends on the number of rows."""
         seen = torch.randn(8, policy.observations, generator=torch.Generator().manual_seed(0))
         act = acting("evaluate", make(num_envs=1), policy)
         with torch.no_grad():
             assert torch.equal(act(seen), torch.cat([act(row[None]) for row in seen]))
 
-    def test_begin_by_their_seeds(self, policy):
+    def test_episodes_begin_by_their_seeds(self, policy):
         found = evaluate(make, policy, 2, 7)
         env = make(num_envs=2)
         observation, _ = env.reset(seed=found.seeds)
@@ -82,13 +82,13 @@ class TestEpisodes:
         torch.testing.assert_close(returns, found.returns)
         assert not torch.equal(evaluate(make, policy, 2, 8).returns, found.returns)
 
-    def test_of_workers_have_the_same_bits(self, policy):
+    def test_episodes_of_workers_have_the_same_bits(self, policy):
         for acts in (policy, "scripted"):
             found = evaluate(make, acts, 2, 3, workers=Pickling())
             assert_same_episodes(found, evaluate(make, acts, 2, 3))
 
     @pytest.mark.slow
-    def test_of_processes_have_the_same_bits(self, policy):
+    def test_episodes_of_processes_have_the_same_bits(self, policy):
         workers = Processes(2)
         try:
             found = evaluate(make, policy, 10, 3, workers=workers)
@@ -96,7 +96,7 @@ class TestEpisodes:
             workers.close()
         assert_same_episodes(found, evaluate(make, policy, 10, 3))
 
-    def test_of_a_trainer_are_the_same(self, policy):
+    def test_a_trainer_evaluates_the_same_episodes(self, policy):
         trainer = Trainer(make, policy.options, num_envs=2)
         mean, success, states = trainer.evaluate(3, seed=5)
         env = make(num_envs=3)
@@ -109,7 +109,7 @@ class TestEpisodes:
         assert success == 0.0
         assert len(states) == 4
 
-    def test_count_what_happened(self, monkeypatch):
+    def test_episodes_count_successes_blocked_motions_and_failures(self, monkeypatch):
         """A temporary success, a blocked motion, and a simulation that fails in step 3."""
         calls = []
 
@@ -136,7 +136,7 @@ class TestEpisodes:
         # The failed step 3 and the remaining step 4 each cost the worst reward.
         assert float(found.returns[1]) < 2 * FoldCloth.worst + 2
 
-    def test_are_short_to_read(self):
+    def test_the_repr_of_episodes_has_three_lines(self):
         flags = torch.arange(64) < 48
         none = torch.zeros(64, dtype=torch.bool)
         found = Episodes(torch.ones(64), flags, flags, none, none, 640, tuple(range(64)))
@@ -145,7 +145,7 @@ class TestEpisodes:
 
 
 @pytest.mark.parametrize(("count", "of"), [(0, 7), (7, 7), (14, 16), (59, 64), (1, 1)])
-def test_the_interval_is_that_of_wilson(count, of):
+def test_the_interval_agrees_with_wilson(count, of):
     from scipy.stats import binomtest
 
     flags = torch.arange(of) < count
@@ -180,7 +180,7 @@ def test_starts_of_different_purposes_are_different(seed):
         ({"make": "FoldCloth"}, TypeError, "evaluate: `make` must be a function"),
     ],
 )
-def test_refusals(change, error, message):
+def test_evaluate_refuses_bad_arguments(change, error, message):
     with pytest.raises(error, match=message):
         evaluate(**({"make": make, "policy": "scripted", "episodes": 1} | change))
 

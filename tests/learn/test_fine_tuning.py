@@ -54,7 +54,7 @@ def successes(monkeypatch, *rates):
 
 class TestInit:
     @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
-    def test_begins_at_the_weights(self, begun, algorithm):
+    def test_training_begins_at_the_weights(self, begun, algorithm):
         """Algorithm, rate, horizon, number of environments and length of episodes may differ."""
         options = replace(OPTIONS, algorithm=algorithm, learning_rate=1e-4, horizon=2, held_out=0)
         longer = functools.partial(dc.envs.make, "FoldCloth", size=5, horizon=6, **SOFT)
@@ -66,14 +66,14 @@ class TestInit:
         trainer.update()
         assert_same_bits(weights(begun), before)
 
-    def test_of_a_file(self, begun, tmp_path):
+    def test_a_policy_from_a_file_begins_a_training(self, begun, tmp_path):
         begun.save(tmp_path / "policy.pt")
         trainer = Trainer(make, num_envs=2, init=load_policy(tmp_path / "policy.pt"))
         assert trainer.options == replace(OPTIONS, max_change=0.02, held_out=16)
         assert_same_bits(weights(trainer.policy), weights(begun))
         assert len(set(trainer.held_out)) == 16
 
-    def test_bounds_that_are_given_stay(self, begun):
+    def test_explicit_bounds_stay(self, begun):
         options = replace(OPTIONS, max_change=0.3, held_out=2)
         assert Trainer(make, options, num_envs=2, init=begun).options == options
         assert Trainer(make, OPTIONS, num_envs=2).options == OPTIONS
@@ -92,7 +92,7 @@ class TestInit:
         with pytest.raises(dc.InvalidInput, match=message):
             Trainer(make, OPTIONS, num_envs=2, init=init(begun))
 
-    def test_must_be_a_policy(self):
+    def test_init_must_be_a_policy(self):
         with pytest.raises(TypeError, match="`init` must be a Policy, got dict"):
             Trainer(make, OPTIONS, num_envs=2, init={})
 
@@ -116,7 +116,7 @@ class TestTrustRegion:
             rows = torch.cat([s.flatten(0, 1) for s in seen])
             return float((trainer.policy(rows) - before(rows)).square().mean().sqrt()), log
 
-    def test_bounds_the_change_of_actions(self, begun, monkeypatch):
+    def test_the_change_of_actions_is_bounded(self, begun, monkeypatch):
         bounded = replace(
             OPTIONS, learning_rate=0.05, plan_learning_rate=0.2, max_change=0.01, held_out=0
         )
@@ -130,7 +130,7 @@ class TestTrustRegion:
         assert change > 0.02
         assert log["step_share"] == 1.0
 
-    def test_an_update_within_it_is_that_without(self, begun):
+    def test_an_update_within_the_bound_is_unchanged(self, begun):
         found = []
         for options in (OPTIONS, replace(OPTIONS, max_change=2.0)):
             trainer = Trainer(make, options, num_envs=2)
@@ -142,7 +142,7 @@ class TestTrustRegion:
 class TestChecks:
     OPTIONS = replace(OPTIONS, held_out=4, check_every=1)
 
-    def test_restore_a_policy_that_succeeds_less(self, begun, monkeypatch):
+    def test_a_policy_that_succeeds_less_is_undone(self, begun, monkeypatch):
         left = successes(monkeypatch, 0.5, 0.75, 0.5, 0.5, 0.75)
         trainer = Trainer(make, self.OPTIONS, num_envs=2, init=begun)
         log = trainer.update()
@@ -159,7 +159,7 @@ class TestChecks:
         assert any(not torch.equal(t, better[n]) for n, t in weights(trainer.policy).items())
         assert (left, trainer.updates) == ([], 4)
 
-    def test_never_end_below_the_beginning(self, begun, monkeypatch):
+    def test_a_training_never_ends_below_its_beginning(self, begun, monkeypatch):
         successes(monkeypatch, 0.5, 0.25, 0.0, 0.25)
         options = replace(self.OPTIONS, check_every=2)
         trainer = Trainer(make, options, num_envs=2, init=begun)
@@ -169,7 +169,7 @@ class TestChecks:
         assert_same_bits(weights(trainer.policy), weights(begun))
         assert trainer.undone == 2
 
-    def test_follow_the_policy_from_starts_of_their_own(self, begun, monkeypatch):
+    def test_checks_have_starts_of_their_own(self, begun, monkeypatch):
         trainer = Trainer(make, self.OPTIONS, num_envs=2, init=begun)
         found = trainer.check()
         assert found == {"held_out": 0.0, "undone": 0.0}
@@ -179,7 +179,7 @@ class TestChecks:
         other = Trainer(make, replace(self.OPTIONS, seed=1), num_envs=2)
         assert not {*other.held_out} & {*trainer.held_out}
 
-    def test_go_on_with_the_same_bits(self, begun, monkeypatch, tmp_path):
+    def test_checks_continue_with_the_same_bits(self, begun, monkeypatch, tmp_path):
         """Interruption while the last good policy differs from the present policy."""
         options = replace(self.OPTIONS, check_every=2)
         rates = 0.5, 0.25, 0.25
@@ -220,7 +220,7 @@ class TestChecks:
         with pytest.raises(dc.InvalidInput, match=message):
             trainer.load(tmp_path / "t.pt")
 
-    def test_files_from_before_there_were_any_load(self, tmp_path):
+    def test_files_without_checks_load(self, tmp_path):
         trainer = Trainer(make, OPTIONS, num_envs=2)
         trainer.update()
         content = record_of(trainer)
@@ -244,6 +244,6 @@ class TestChecks:
         ({"check_every": 0}, "`check_every` must be at least 1"),
     ],
 )
-def test_bad_options(options, message):
+def test_bad_options_are_refused(options, message):
     with pytest.raises(dc.InvalidInput, match=message):
         TrainerOptions(**options)

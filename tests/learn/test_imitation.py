@@ -55,7 +55,7 @@ def test_a_function_is_imitated():
     assert float((policy(observation).detach() - 0.5).abs().max()) < 0.05
 
 
-def test_plans_are_followed_and_planned_again():
+def test_the_first_round_follows_plans_and_later_rounds_plan_again():
     """The first round follows the plans; later rounds begin from new starts."""
     env = SOFT(num_envs=2)
     draws = torch.Generator().manual_seed(0)
@@ -84,7 +84,7 @@ def test_plans_are_followed_and_planned_again():
     assert bool((new >= old).all())
 
 
-def test_plans_teach():
+def test_a_policy_learns_from_plans_with_the_same_bits():
     plans = plan(SOFT, episodes=2, attempts=1, knots=3, iterations=1)
     policies = [imitate(SOFT, plans, **FEW).state_dict() for _ in range(2)]
     assert all(torch.equal(value, policies[1][name]) for name, value in policies[0].items())
@@ -112,7 +112,7 @@ def test_the_teacher_labels_the_states_that_the_policy_visits():
             observation, *_ = env.step(first(observation))
 
 
-def test_observations_are_scaled_by_those_of_the_first_round():
+def test_the_scale_of_observations_comes_from_the_first_round():
     teacher = Recorder()
     policy = imitate(MAKE, teacher, **FEW)
     rows = torch.cat(teacher.seen[:5])
@@ -120,7 +120,7 @@ def test_observations_are_scaled_by_those_of_the_first_round():
     torch.testing.assert_close(policy.scale.mean, rows.mean(dim=0))
 
 
-def test_a_seed_has_its_bits_for_any_threads_and_draws():
+def test_bits_depend_on_the_seed_but_not_on_threads_and_other_draws():
     expected = imitate(MAKE, "scripted", **FEW).state_dict()
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -171,7 +171,7 @@ def test_a_trainer_of_the_same_options_has_the_same_networks():
         ),
     ],
 )
-def test_arguments_that_are_refused(change, error, message):
+def test_imitate_refuses_bad_arguments(change, error, message):
     arguments = {"make": MAKE, "teacher": "scripted"} | FEW | change
     with pytest.raises(error, match=f"^imitate: {message}"):
         imitate(**arguments)

@@ -62,7 +62,7 @@ def begun(command, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGKILL", "SIGHUP", "SIGSEGV"])
 @pytest.mark.parametrize("command", ["train", "fit"])
-def test_no_process_is_left_behind(tmp_path, command, number):
+def test_workers_end_with_a_killed_command(tmp_path, command, number):
     main, workers = begun(command, tmp_path)
     main.send_signal(signal.Signals[number])
     begin = time.monotonic()
@@ -73,7 +73,7 @@ def test_no_process_is_left_behind(tmp_path, command, number):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "fit"])
-def test_an_interrupt_says_how_to_go_on(tmp_path, command):
+def test_an_interrupted_command_prints_how_to_resume(tmp_path, command):
     main, workers = begun(command, tmp_path)
     main.send_signal(signal.SIGINT)
     begin = time.monotonic()

@@ -52,7 +52,7 @@ def begun(count=2):
 
 
 class TestPlan:
-    def test_replays_by_the_environments(self, found):
+    def test_a_plan_replays_in_environments(self, found):
         assert len(found) == 3
         assert found.actions.shape == (3, 5, 8)
         returns, success = followed(MAKE, found)
@@ -60,18 +60,18 @@ class TestPlan:
         assert torch.equal(success, found.success)
         assert len(set(found.seeds.tolist())) == 3
 
-    def test_has_the_same_bits_from_pickled_pieces(self, found):
+    def test_a_plan_has_the_same_bits_from_pickled_pieces(self, found):
         assert_same(plan(MAKE, workers=Jobs(Inline()), **FEW), found)
 
     @pytest.mark.slow
-    def test_has_the_same_bits_in_processes(self, found):
+    def test_a_plan_has_the_same_bits_in_processes(self, found):
         workers = Processes(2)
         try:
             assert_same(plan(MAKE, workers=workers, **FEW), found)
         finally:
             workers.close()
 
-    def test_has_the_same_bits_for_any_threads_and_draws(self, found):
+    def test_a_plan_has_the_same_bits_for_any_threads_and_draws(self, found):
         before = torch.get_num_threads()
         torch.set_num_threads(2)
         torch.manual_seed(5)
@@ -87,7 +87,7 @@ class TestPlan:
         other = plan(MAKE, **(FEW | {"seed": 5, "iterations": 1, "attempts": 1}))
         assert not set(other.seeds.tolist()) & set(found.seeds.tolist())
 
-    def test_begins_on_a_coarser_sheet(self, monkeypatch):
+    def test_planning_begins_on_a_coarser_sheet(self, monkeypatch):
         sizes = []
 
         def make(num_envs, size=5):
@@ -99,7 +99,7 @@ class TestPlan:
         returns, _ = followed(MAKE, plans)
         torch.testing.assert_close(returns, plans.returns.float(), atol=1e-5, rtol=0)
 
-    def test_goes_on_from_the_plan_that_serves_each_start_best(self):
+    def test_planning_continues_from_the_best_plan_of_each_start(self):
         """Start 0 continues from plan 1, by return, and start 1 from plan 0, by success."""
         knots = torch.arange(2.0, dtype=torch.float64)[:, None, None]
         stages = []
@@ -122,7 +122,7 @@ class TestPlan:
 
 
 class TestImprove:
-    def test_divides_the_gradient_of_each_start_by_its_norm(self, monkeypatch):
+    def test_the_gradient_of_each_start_is_divided_by_its_norm(self, monkeypatch):
         """Powers of two that scale the gradient of a start, by iterate, change no bit."""
         env, start, knots = begun()
         expected = improve(env, start, knots, 3, rate=2e-3)
@@ -139,19 +139,19 @@ class TestImprove:
         assert torch.equal(found.knots, expected.knots)
         assert not torch.equal(found.knots, knots)
 
-    def test_improves_returns(self):
+    def test_returns_improve(self):
         env, start, knots = begun()
         found, tried = (improve(env, start, knots, count, rate=2e-3) for count in (3, 0))
         assert bool((found.returns > tried.returns).all())
 
-    def test_keeps_the_best_iterate(self):
+    def test_the_best_iterate_is_kept(self):
         """With a learning rate too large for so short an episode, the first iterate is best."""
         env, start, knots = begun()
         found = improve(env, start, knots, 3, rate=0.1)
         assert torch.equal(found.knots, knots)
         torch.testing.assert_close(found.actions, (hats(5, 3) @ knots).tanh())
 
-    def test_prefers_success_to_return(self):
+    def test_success_is_preferred_to_return(self):
         one = torch.ones(2, 1, 1, dtype=torch.float64)
         returns = torch.tensor([2.0, 1.0], dtype=torch.float64)
         old = Improved(one, one, returns, torch.tensor([False, True]))
@@ -179,7 +179,7 @@ class TestImprove:
         assert found.returns[1] < expected.returns[1] - 1
         assert not found.success[1]
 
-    def test_goes_on_from_the_middle_of_an_episode(self):
+    def test_plans_continue_from_the_middle_of_an_episode(self):
         env, start, knots = begun()
         whole = improve(env, start, knots, 0)
         place = start
@@ -189,7 +189,7 @@ class TestImprove:
         assert torch.equal(rest.actions, whole.actions[:, 2:])
         assert bool((rest.returns.abs() < whole.returns.abs()).all())
 
-    def test_refuses_gradients_that_are_not_finite(self, monkeypatch):
+    def test_gradients_that_are_not_finite_are_refused(self, monkeypatch):
         env, start, knots = begun()
         reward = type(env.task).reward
         monkeypatch.setattr(
@@ -254,7 +254,7 @@ class TestFiles:
         ({"seeds": torch.tensor([1, 2])}, InvalidInput, "`seeds` must be of 1 starts, got 2"),
     ],
 )
-def test_plans_that_are_refused(change, error, message):
+def test_bad_plans_are_refused(change, error, message):
     accepted = {
         "actions": torch.zeros(1, 2, 3, dtype=torch.float64),
         "returns": torch.zeros(1, dtype=torch.float64),
@@ -290,7 +290,7 @@ def test_plans_that_are_refused(change, error, message):
         ),
     ],
 )
-def test_arguments_that_are_refused(change, error, message):
+def test_plan_refuses_bad_arguments(change, error, message):
     arguments = {"make": MAKE} | FEW | change
     with pytest.raises(error, match=f"^plan: {message}"):
         plan(**arguments)

@@ -69,7 +69,7 @@ def test_the_required_memory_is_that_of_all_weights(monkeypatch, options):
 
 
 class TestSizes:
-    def test_of_environments(self):
+    def test_sizes_follow_from_an_environment(self):
         env = make(num_envs=1)
         sizes = PolicySizes.of(env)
         assert (sizes.observations,) == env.single_observation_space.shape
@@ -88,11 +88,11 @@ class TestSizes:
             ((3, 3, 3), "`time` must be at most 2"),
         ],
     )
-    def test_bad_ones(self, sizes, message):
+    def test_bad_sizes_are_refused(self, sizes, message):
         with pytest.raises(dc.InvalidInput, match=f"PolicySizes: {message}"):
             PolicySizes(*sizes)
 
-    def test_a_plan_needs_a_time(self):
+    def test_a_plan_needs_the_time_in_observations(self):
         with pytest.raises(dc.InvalidInput, match="`plan_knots` must be 0"):
             Policy(PolicySizes(7, 3), OPTIONS)
         with pytest.raises(dc.InvalidInput, match="`first_action` must have 3 numbers, got 2"):
@@ -101,7 +101,7 @@ class TestSizes:
 
 class TestFiles:
     @pytest.mark.parametrize("algorithm", ["apg", "sapo"])
-    def test_hold_the_policy(self, tmp_path, observation, algorithm):
+    def test_a_saved_policy_loads(self, tmp_path, observation, algorithm):
         policy = policy_of(replace(OPTIONS, algorithm=algorithm))
         policy.save(tmp_path / "policy.pt")
         before = torch.get_rng_state()
@@ -113,7 +113,7 @@ class TestFiles:
         assert torch.load(tmp_path / "policy.pt", weights_only=True)["sizes"]["actions"] == 3
 
     @pytest.mark.parametrize("knots", [0, 3])
-    def test_of_trainers_hold_it_too(self, tmp_path, knots):
+    def test_a_policy_loads_from_the_file_of_a_trainer(self, tmp_path, knots):
         options = TrainerOptions("sapo", horizon=2, hidden=(8,), critic_epochs=1, plan_knots=knots)
         trainer = Trainer(make, options, num_envs=2)
         trainer.update()
@@ -123,7 +123,7 @@ class TestFiles:
         observation, _ = make(num_envs=2).reset(seed=0)
         assert torch.equal(found(observation), trainer.act(observation))
 
-    def test_that_are_none_are_refused_by_name(self, tmp_path):
+    def test_other_files_are_refused_by_name(self, tmp_path):
         file = tmp_path / "policy.pt"
         with pytest.raises(dc.InvalidInput, match="load_policy: `path` must be a file, got"):
             load_policy(file)
@@ -158,7 +158,7 @@ class TestFiles:
             ("policy", [1.0]),
         ],
     )
-    def test_with_other_content_are_refused_by_name(self, tmp_path, part, value):
+    def test_files_with_other_content_are_refused_by_name(self, tmp_path, part, value):
         weights = policy_of().state_dict()
         content = {"sizes": asdict(SIZES), "options": asdict(OPTIONS), "policy": dict(weights)}
         write_checkpoint(tmp_path / "p.pt", "policy", content)
@@ -167,7 +167,7 @@ class TestFiles:
         with pytest.raises(dc.InvalidInput, match=r"^load_policy: .*p\.pt"):
             load_policy(tmp_path / "p.pt")
 
-    def test_with_weights_that_are_not_finite_are_refused(self, tmp_path):
+    def test_weights_that_are_not_finite_are_refused(self, tmp_path):
         weights = policy_of().state_dict()
         weights["scale.mean"] = torch.full_like(weights["scale.mean"], torch.nan)
         content = {"sizes": asdict(SIZES), "options": asdict(OPTIONS), "policy": dict(weights)}
@@ -177,7 +177,7 @@ class TestFiles:
 
 
 class TestExport:
-    def test_needs_its_extra(self, tmp_path, monkeypatch):
+    def test_export_needs_its_extra(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "onnx", None)
         with pytest.raises(dc.InvalidInput, match=r"needs onnx: run .*diffcloth-torch\[onnx\]"):
             policy_of().export(tmp_path / "policy.onnx")
@@ -186,7 +186,7 @@ class TestExport:
     @pytest.mark.slow
     @pytest.mark.parametrize("algorithm", ["apg", "sapo"])
     @pytest.mark.parametrize("knots", [0, 4])
-    def test_computes_the_same_actions(self, tmp_path, observation, algorithm, knots):
+    def test_an_export_computes_the_same_actions(self, tmp_path, observation, algorithm, knots):
         runtime = pytest.importorskip("onnxruntime", reason="pip install onnxruntime")
         pytest.importorskip("onnxscript", reason="onnxscript is in the extra `onnx`")
         policy = policy_of(replace(OPTIONS, algorithm=algorithm, plan_knots=knots))
@@ -207,7 +207,7 @@ class TestBeginAt:
     @pytest.mark.parametrize(
         ("before", "after"), [("apg", "shac"), ("shac", "sapo"), ("sapo", "apg"), ("sapo", "sapo")]
     )
-    def test_has_the_same_actions(self, observation, before, after, knots):
+    def test_a_policy_begins_with_the_actions_of_another(self, observation, before, after, knots):
         one = policy_of(replace(OPTIONS, algorithm=before, plan_knots=knots))
         other = policy_of(replace(OPTIONS, algorithm=after, plan_knots=knots), seed=1)
         critics = {n: t.clone() for n, t in other.critics.state_dict().items()}

@@ -54,7 +54,7 @@ def record_of(folder):
     return json.loads((folder / "train.json").read_text())
 
 
-def test_results(config, tmp_path):
+def test_a_training_writes_its_results(config, tmp_path):
     result = call(config, "--out", tmp_path / "out", "--debug")
     assert result.exit_code == 0, result.output
     assert "32 environment steps" in result.output
@@ -262,7 +262,7 @@ def test_a_seed_that_succeeds_is_the_last_one(config, tmp_path):
         ("tryout={seeds: [1, -1], updates: 2}", "tryout.seeds"),
     ],
 )
-def test_bad_configurations(config, tmp_path, assignment, message):
+def test_bad_configurations_are_refused(config, tmp_path, assignment, message):
     result = call(config, "--out", tmp_path / "out", "--set", assignment)
     assert result.exit_code == 2, result.output
     assert message in result.output

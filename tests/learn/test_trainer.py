@@ -84,7 +84,7 @@ class TestGradient:
     @pytest.mark.parametrize(
         ("algorithm", "knots"), [("apg", 0), ("apg", 3), ("shac", 0), ("sapo", 0), ("sapo", 3)]
     )
-    def test_is_that_of_differences(self, algorithm, knots):
+    def test_the_gradient_agrees_with_differences(self, algorithm, knots):
         options = replace(self.OPTIONS, algorithm=algorithm, temperature=0.02, plan_knots=knots)
         trainer = self.trainer(options)
         found = self.rollout(trainer)
@@ -103,7 +103,7 @@ class TestGradient:
         slope = (losses[0] - losses[1]) / (2 * float(step))
         assert slope == pytest.approx(float(scale) ** 2, rel=0.02)
 
-    def test_without_feedback_is_that_of_a_plan(self):
+    def test_the_gradient_without_feedback_agrees_with_a_plan(self):
         options = TrainerOptions(algorithm="shac", horizon=5, first_action=HOLD)
         trainer = self.trainer(options)
         found = self.rollout(trainer)
@@ -125,7 +125,7 @@ class TestGradient:
         for e, g in zip(expected, found.gradients, strict=True):
             torch.testing.assert_close(g, e, rtol=1e-4, atol=1e-6)
 
-    def test_feedback_counts(self):
+    def test_feedback_changes_the_gradient_and_not_the_loss(self):
         with_it, without = (
             self.rollout(self.trainer(TrainerOptions(horizon=5, first_action=HOLD, feedback=f)))
             for f in (True, False)
@@ -137,7 +137,7 @@ class TestGradient:
 class TestPlan:
     """Plan of a policy: knots, plus a linear function and a network of the observation."""
 
-    def test_draws_lines_between_its_knots(self):
+    def test_a_plan_is_linear_between_its_knots(self):
         plan = Plan(3, torch.tensor([0.5, -1.0]), 3)
         with torch.no_grad():
             plan.knots.copy_(torch.tensor([[0.0, 1.0], [2.0, -1.0], [3.0, 5.0]]))
@@ -149,7 +149,7 @@ class TestPlan:
             expected = torch.from_numpy(lines).float() + seen @ plan.gains[axis].detach()
             torch.testing.assert_close(plan(seen, time)[:, axis].detach(), expected)
 
-    def test_begins_with_the_first_action_at_all_times(self):
+    def test_a_plan_begins_with_the_first_action_at_all_times(self):
         for knots in (1, 4):
             options = TrainerOptions(horizon=3, first_action=HOLD, plan_knots=knots)
             trainer = Trainer(fold(), options, num_envs=2)
@@ -161,7 +161,7 @@ class TestPlan:
                 )
                 observation, *_ = trainer._env.step(action)
 
-    def test_sees_the_time(self):
+    def test_a_plan_reads_the_time(self):
         """Actions change with the time of the environment by the plan alone."""
         trainer = Trainer(fold(), TrainerOptions("apg", horizon=3, plan_knots=9), num_envs=2)
         plan = trainer.policy.actor.plan
@@ -174,7 +174,7 @@ class TestPlan:
             torch.testing.assert_close(action, torch.full((2, 8), k / 8).tanh())
             observation, *_ = trainer._env.step(action)
 
-    def test_has_a_rate_of_its_own(self):
+    def test_a_plan_has_its_own_learning_rate(self):
         options = TrainerOptions(
             "apg", horizon=8, first_action=HOLD, plan_knots=3,
             plan_learning_rate=0.3, learning_rate=0.01, decay_updates=2,
@@ -190,7 +190,7 @@ class TestPlan:
         rates = [group["lr"] for group in trainer._actor_steps.param_groups]
         assert rates == pytest.approx([0.55 * 0.01, 0.55 * 0.3])
 
-    def test_needs_a_time(self, monkeypatch):
+    def test_a_plan_needs_the_time_in_observations(self, monkeypatch):
         real = FoldCloth.features
 
         def timeless(task, env):
@@ -205,7 +205,7 @@ class TestPlan:
 class TestTensorAdam:
     """Adam with one scale for each tensor."""
 
-    def test_is_adam_where_numbers_are_alone(self):
+    def test_tensor_adam_is_adam_for_single_numbers(self):
         """For tensors of one number, the scales equal the scales of torch's Adam."""
         ours, theirs = (
             [torch.tensor([0.3], requires_grad=True), torch.tensor(-2.0, requires_grad=True)]
@@ -230,7 +230,7 @@ class TestTensorAdam:
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
         assert abs(float(ours[0].detach()) - 0.3) > 0.3
 
-    def test_is_the_recursion(self):
+    def test_tensor_adam_follows_its_recursion(self):
         first, second, rate = 0.7, 0.9, 0.05
         generator = np.random.default_rng(0)
         x = generator.standard_normal((3, 4)).astype(np.float32)
@@ -246,7 +246,7 @@ class TestTensorAdam:
             expected -= rate * mean / (1 - first**k) / np.sqrt(square / (1 - second**k))
         np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-4, atol=1e-5)
 
-    def test_moves_little_what_counts_little(self):
+    def test_the_first_step_follows_the_gradient(self):
         """The first step is along the gradient; entries of Adam's first step have equal size."""
         moved = {}
         for scale in ("number", "tensor"):
@@ -272,7 +272,7 @@ class TestTensorAdam:
         torch.testing.assert_close(moved["number"], -0.1 * gradient.sign(), rtol=0.03, atol=1e-4)
 
 
-def test_lambda_returns_are_those_of_the_recursion():
+def test_lambda_returns_follow_the_recursion():
     generator = torch.Generator().manual_seed(0)
     h, count, gamma, trace = 7, 3, 0.9, 0.8
     rows = rollouts_rows(h, count, generator)
@@ -291,7 +291,7 @@ def test_lambda_returns_are_those_of_the_recursion():
 class TestEntropy:
     """Entropy of SAPO: value, temperature, and effect on policy and critics."""
 
-    def test_is_that_of_the_density(self):
+    def test_entropy_agrees_with_the_density(self):
         """Equal to minus the log density of torch.distributions, also at the bounds of actions."""
         first = torch.tensor([0.0, 0.95, -0.3])
         torch.manual_seed(0)
@@ -321,7 +321,7 @@ class TestEntropy:
             assert log["temperature"] == before == pytest.approx(1e-3)
             assert sign * (trainer.policy.temperature - before) > 0
 
-    def test_is_part_of_the_loss_and_of_what_critics_learn(self):
+    def test_entropy_is_part_of_the_loss_and_of_critic_targets(self):
         """If the entropy bonus dominates rewards, it determines loss and critic targets."""
         options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, gae_lambda=1.0)
         trainer = Trainer(fold(), options, num_envs=2)
@@ -331,7 +331,7 @@ class TestEntropy:
         # Initial values are nearly zero, so critic errors equal the entropy bonus.
         assert trainer._fit_critics(_Rows([rollout])) > 1e6
 
-    def test_critics_differ_and_their_least_is_learned(self, monkeypatch):
+    def test_critics_differ_and_learn_their_minimum(self, monkeypatch):
         options = TrainerOptions("sapo", horizon=3, critics=3)
         trainer = Trainer(fold(), options, num_envs=2)
         kept = []
@@ -423,7 +423,7 @@ def test_files_of_other_tasks_do_not_load(tmp_path):
         Trainer(fold(), options).save(tmp_path / "no" / "a.pt")
 
 
-def test_an_end_that_is_no_failure_is_not_counted_as_one(monkeypatch):
+def test_an_end_by_the_task_is_not_counted_as_a_failure(monkeypatch):
     trainer = Trainer(fold(), TrainerOptions(algorithm="apg", horizon=3), num_envs=2)
     monkeypatch.setattr(FoldCloth, "terminal", lambda task, env: env.elapsed == 2)
     log = trainer.update()
@@ -446,7 +446,7 @@ def test_a_gradient_that_is_not_finite_ends_the_training():
         Trainer(make, TrainerOptions(algorithm="apg", horizon=3)).update()
 
 
-def test_threads_outside_do_not_matter():
+def test_an_update_does_not_depend_on_threads_of_the_caller():
     found = []
     for count in (1, 2):
         with threads(count):
@@ -490,7 +490,7 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
 
 
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
-def test_a_failure_costs_all_that_is_left(algorithm, monkeypatch):
+def test_a_failure_costs_the_rest_of_the_episode(algorithm, monkeypatch):
     """Evaluations (compared by tryouts), rollouts and critic targets include the cost."""
     from diffcloth_torch.envs import env as module
 
@@ -630,7 +630,7 @@ def test_a_plan_with_one_scale_improves_faster(seed):
     assert found["tensor"] > 0.75 * found["number"]
 
 
-def test_noise_and_scale_of_a_policy():
+def test_a_policy_adds_noise_and_scales_observations():
     env = fold()(num_envs=3)
     policy = Policy(env, TrainerOptions(first_action=HOLD, init_std=0.2))
     observation, _ = env.reset(seed=0)
@@ -702,6 +702,6 @@ def test_options_under_names_of_0_1_are_refused_with_the_new_ones(old, new):
         (lambda: envs.make("FoldCloth", opens_at=1.0), r"`opens_at` must be in \[-1, 1\)"),
     ],
 )
-def test_bad_input(make, message):
+def test_bad_arguments_are_refused(make, message):
     with pytest.raises(InvalidInput, match=message):
         make()

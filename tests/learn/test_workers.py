@@ -41,7 +41,7 @@ def assert_same(found, expected):
         assert torch.equal(tensor, found[0][name]), name
 
 
-def test_processes(here):
+def test_processes_have_the_same_bits(here):
     workers = Processes(2)
     try:
         assert_same(train(workers), here)
@@ -50,7 +50,7 @@ def test_processes(here):
 
 
 @pytest.mark.slow
-def test_jobs_of_whatever_submits(here):
+def test_jobs_of_any_executor_have_the_same_bits(here):
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         assert_same(train(Jobs(pool)), here)
         assert_same(train(pool), here)
@@ -176,7 +176,7 @@ class TestRay:
             ray.shutdown()
 
     @pytest.mark.slow
-    def test_same_bits_also_where_an_actor_dies_in_an_update(self, ray, here, tmp_path):
+    def test_an_actor_that_dies_in_an_update_changes_no_bit(self, ray, here, tmp_path):
         workers = RayActors(2)
         try:
             assert_same(train(workers, make=dying(tmp_path)), here)
@@ -185,7 +185,7 @@ class TestRay:
             workers.close()
 
     @pytest.mark.slow
-    def test_same_bits_also_where_an_actor_is_killed_between_updates(self, ray, here):
+    def test_an_actor_killed_between_updates_changes_no_bit(self, ray, here):
         workers = RayActors(2)
         try:
             trainer = Trainer(MAKE, OPTIONS, num_envs=4, chunk=2, workers=workers)
@@ -263,7 +263,7 @@ workers.close()
 
 
 @pytest.mark.slow
-def test_ranks_of_torchrun(tmp_path, here):
+def test_ranks_of_torchrun_have_the_same_bits(tmp_path, here):
     import hashlib
 
     script = tmp_path / "job.py"

@@ -89,7 +89,7 @@ def test_solution_has_a_residual_of_rounding(matrix, backend, level):
     assert (np.abs(dense @ x - b) <= ROUNDING.get(backend, 1e-13) * bound).all()
 
 
-def test_analysis_counts_what_a_dense_elimination_fills(matrix):
+def test_the_analysis_counts_the_fill_of_a_dense_elimination(matrix):
     """Entries of L: no fewer than the pattern needs, no more than the lower triangle."""
     n = len(matrix.unknowns)
     for backend in kernels.cholesky_backends():

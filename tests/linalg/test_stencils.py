@@ -86,7 +86,7 @@ def dense(blocks: list[float]) -> np.ndarray:
 
 @pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS.keys())
 @pytest.mark.parametrize(("make", "points"), [(by_vectors, 4), (by_core, 4), (by_core, 5)])
-def test_stencil(make, points, rows):
+def test_a_stencil_adds_its_lower_blocks(make, points, rows):
     rows = rows[:points]
     arguments, h = make(numbers(points))
     expected = np.zeros((SIZE, 3, SIZE, 3))

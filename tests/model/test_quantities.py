@@ -66,7 +66,7 @@ def test_a_table_names_the_fields(kind):
     assert list(TABLES[kind]) == [name for name in fields if name != "report"]
 
 
-def test_the_core_takes_what_the_tables_say():
+def test_the_core_has_the_inputs_of_the_tables():
     names = [q.core for table in TABLES.values() for q in table.values() if q.core]
     assert set(names) | set(DERIVED) == set(_core.input_names)
     assert not set(names) & set(DERIVED)

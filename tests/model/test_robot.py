@@ -368,7 +368,7 @@ def test_links_that_fixed_joints_join_have_one_inertia(tmp_path):
         load(tmp_path, *parts, link("arm", rod), link("tip", rod), straight)
 
 
-def test_dynamic_is_what_forces_move(tmp_path):
+def test_a_robot_is_dynamic_if_forces_move_it(tmp_path):
     assert load(tmp_path, *two_links(), actuation="torque").mechanism.is_dynamic
     assert load(tmp_path, *two_links(), base="floating", actuation="position").mechanism.is_dynamic
     assert not load(
@@ -588,7 +588,7 @@ def test_a_scene_joins_bodies_and_robots(tmp_path):
     assert values["friction"][1, 3].item() == pytest.approx((0.9 * 0.4) ** 0.5)
 
 
-def test_parameters_of_what_does_not_move_by_forces_are_absent(tmp_path):
+def test_parameters_of_prescribed_bodies_are_absent(tmp_path):
     box = dc.RigidBody.box(0.1, motion="kinematic")
     scene = dc.Scene([dc.Cloth.grid(2, 2)], [box], [three_joints(tmp_path, actuation="position")])
     values = scene_parameters(scene, assemble(scene), contact=True)
@@ -637,7 +637,7 @@ def test_a_robot_pickles():
 # --- Robots of the package ------------------------------------------------------------------------
 
 
-def test_the_gripper_is_what_its_script_makes():
+def test_the_gripper_is_the_output_of_its_script():
     made = runpy.run_path(str(ROOT / "scripts" / "make_gripper.py"))
     assert dc.robots.GRIPPER.read_text() == made["gripper"]()
 

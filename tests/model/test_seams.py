@@ -211,7 +211,7 @@ def test_the_default_barrier_is_the_one_of_the_sheet():
         torch.testing.assert_close(values[1], values[0], rtol=1e-9, atol=0)
 
 
-def test_a_piece_of_another_size_stretches_what_it_is_sewn_to():
+def test_a_piece_of_another_size_stretches_its_neighbor():
     """A piece at half the size has a quarter of the mass; no rest configuration exists in space."""
     flat = dc.Cloth.grid((3, 2), (0.2, 0.1))
     island = (flat.vertices[flat.faces].mean(axis=1)[:, 0] > 0).astype(int)

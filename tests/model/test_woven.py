@@ -43,7 +43,7 @@ def test_axes_are_directions_in_the_rest_frames_of_faces():
     np.testing.assert_array_equal(dc.Cloth(*SHEET).directions, [1.0, 0.0, 0.0])
 
 
-def test_the_warp_is_what_lies_along_x_unless_said_otherwise():
+def test_the_warp_lies_along_x_by_default():
     """A sheet that hangs by its warp is stretched less than one that hangs by its weft."""
     material = dc.Material(stretch=200.0, stretch_weft=20.0, density=0.5)
     along_y = {
@@ -214,7 +214,7 @@ def test_directions_survive_a_pickle():
     assert sheet.material.bending_twill == WOVEN["bending_twill"]
 
 
-def test_a_material_shows_what_it_sets():
+def test_a_material_shows_its_set_fields():
     assert "weft" not in repr(dc.Material())
     assert "stretch_weft=200" in repr(dc.Material(**WOVEN))
     assert dataclasses.replace(dc.Material(**WOVEN), stretch=1.0).stretch_weft == 200.0

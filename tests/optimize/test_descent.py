@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch.optimize.descent import TrialError
 
 F64 = torch.float64
 SGD = partial(torch.optim.SGD, lr=0.25)
@@ -359,6 +360,26 @@ def test_random_numbers_of_torch_are_resumed():
     half = run(2)
     torch.manual_seed(99)
     assert torch.equal(run(6, half).next_variables["a"], whole.next_variables["a"])
+
+
+@pytest.mark.parametrize("per_environment", [[], ["a"]])
+def test_the_loop_itself_draws_no_random_numbers(per_environment):
+    calls = []
+
+    def simulate(v):
+        calls.append(v)
+        if len(calls) == 2:
+            raise TrialError("a failure that the loop undoes")
+        status = "not_converged" if len(calls) == 4 else "converged"
+        return [state_of(v["a"], ["converged", status])]
+
+    before = torch.random.get_rng_state()
+    found = dc.descend(
+        simulate, squares, {"a": leaf(0.9, -0.8)}, ADAM,
+        iterations=4, restart=True, per_environment=per_environment,
+    )  # fmt: skip
+    assert len(found.failures) == 2
+    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_keywords_of_0_1_warn_with_the_names_of_today():

@@ -278,7 +278,7 @@ class TestResiduals:
             ),
         ],
     )
-    def test_bad_input(self, strip, call, message):
+    def test_bad_arguments_are_refused(self, strip, call, message):
         states = rollout(strip, strip.default_parameters())
         with pytest.raises(dc.InvalidInput, match=message):
             call(states)
@@ -354,7 +354,7 @@ class TestResiduals:
         ),
     ],
 )
-def test_bad_input(call, error, message):
+def test_bad_arguments_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
 

@@ -124,7 +124,7 @@ def test_a_stage_ends_at_its_own_tolerance():
         dc.fit(VARIABLES, [stages[1], dc.Stage(residuals, tolerance=0.0)])
 
 
-def test_a_stage_keeps_what_it_does_not_free_and_the_next_begins_there():
+def test_a_stage_keeps_fixed_variables_and_the_next_begins_there():
     seen = []
 
     def quiet(parameters, values):
@@ -226,7 +226,7 @@ def test_a_late_and_biased_sensor_is_found():
         (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be finite and > 1"),
     ],
 )
-def test_bad_input(call, error, message):
+def test_bad_arguments_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
 
@@ -360,7 +360,7 @@ class TestOutline:
             ({"faces": np.zeros((0, 3), int)}, r"`faces` must have shape \[F, 3\] with F >= 1"),
         ],
     )
-    def test_bad_input(self, change, message):
+    def test_bad_arguments_are_refused(self, change, message):
         cloth, state = self.sheet()
         square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         given = {"outlines": [square], "faces": cloth.faces, "center": (0.0, 0.0), "noise": 1.0}

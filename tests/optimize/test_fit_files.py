@@ -159,7 +159,7 @@ def test_values_print_six_digits(found):
     assert "'y': [30] numbers from 12.3457 to 12.3457" in text
 
 
-def test_what_the_observations_do_not_tell_is_a_sentence():
+def test_undetermined_variables_are_named_in_a_sentence():
     free = {"stretch": dc.Variable(300.0), "bending": dc.Variable(1e-4)}
     seen = torch.tensor([1.0, 1.1, 0.9], dtype=F64)
     made = dc.fit(free, lambda p: p.stretch / 300 - seen + 0 * p.bending, covariance="white")
@@ -170,7 +170,7 @@ def test_what_the_observations_do_not_tell_is_a_sentence():
     assert str(made.unidentifiable[0]) == "+1.00 bending (not seen in the observations at all)"
 
 
-def test_the_page_names_what_was_kept_out_and_the_size_of_distances(tmp_path):
+def test_the_page_names_held_out_frames_and_the_size_of_distances(tmp_path):
     cloth = dc.Cloth.grid(2, 2, 0.1)
     sim = dc.Simulator(dc.Scene([cloth]), 0.01, contact=dc.ContactOptions(self_contact=False))
     start = sim.initial_state()

@@ -60,7 +60,7 @@ def test_information_is_the_width_of_the_fit_with_the_recording(found):
     assert all(width < before for width, before in zip(expected.values(), now, strict=True))
 
 
-def test_a_recording_makes_known_what_was_not():
+def test_a_recording_determines_unknown_variables():
     found = dc.fit({"x": dc.Variable([1.0, 2.0])}, lambda p, v: v["x"].sum()[None] - 3 + SEEN[:9])
     assert len(found.unidentifiable) == 1
     expected = found.information(lambda p, v: (v["x"][0] - v["x"][1])[None] / 0.2)
@@ -94,7 +94,7 @@ def test_a_fit_prints_its_numbers_and_no_residuals(found):
 
 
 @pytest.mark.parametrize("name", ["predict", "information"])
-def test_what_is_no_function_is_refused(found, name):
+def test_objects_that_are_no_functions_are_refused(found, name):
     with pytest.raises(TypeError, match=f"Fit.{name}: `.*` must be a function, got float"):
         getattr(found, name)(1.0)
     with pytest.raises(TypeError, match="must return a tensor"):

@@ -136,6 +136,6 @@ def test_first_values_of_no_material_are_refused():
         ({"seed": -1}, dc.InvalidInput, "`seed` must be at least 0"),
     ],
 )
-def test_bad_input(options, error, message):
+def test_bad_arguments_are_refused(options, error, message):
     with pytest.raises(error, match=message):
         dc.fit(VARIABLES, residuals, **options)

@@ -101,7 +101,7 @@ def test_other_priors_are_another_fit(tmp_path):
         ),
     ],
 )
-def test_bad_priors(call, error, message):
+def test_bad_priors_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
 
@@ -188,6 +188,6 @@ TWO = {"slope": dc.Variable(0.0, prior=(1.0, 0.1)), "shift": dc.Variable(0.0)}
         ),
     ],
 )
-def test_bad_priors_and_ties(call, error, message):
+def test_bad_priors_and_ties_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()

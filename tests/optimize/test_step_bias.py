@@ -262,7 +262,7 @@ def test_residuals_that_are_not_linear_in_positions_are_refused():
         ),
     ],
 )
-def test_refused(call, error, message):
+def test_bad_arguments_are_refused(call, error, message):
     found = dc.fit(variables(), Decay(0.05))
     with pytest.raises(error, match=message):
         call(found)

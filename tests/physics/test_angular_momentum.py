@@ -46,7 +46,7 @@ def spinning(simulator, axis, speed):
 @pytest.mark.parametrize(
     ("speed", "dt", "steps", "axis"), [(4.0, 0.02, 12, 2), (15.0, 4e-3, 30, 2), (6.0, 0.01, 25, 1)]
 )
-def test_a_free_sheet_keeps_what_the_formula_says(speed, dt, steps, axis):
+def test_a_free_sheet_keeps_the_momentum_of_the_formula(speed, dt, steps, axis):
     sheet = dc.Cloth.grid(4, 3, (0.15, 0.1), material=dc.Material(stretch=5000.0))
     simulator = dc.Simulator(
         dc.Scene([sheet], gravity=WEIGHTLESS), dt, solver=dc.SolverOptions(tolerance=1e-10)
@@ -111,7 +111,7 @@ def test_boxes_that_a_cord_presses_together_lose_that_of_their_centers(speed, dt
 
 
 @pytest.mark.parametrize(("turning", "dt", "radius"), [(4.0, 0.015, 0.03), (8.0, 4e-3, 0.015)])
-def test_a_ball_on_a_turntable_gains_what_the_formula_says(turning, dt, radius):
+def test_a_ball_on_a_turntable_gains_the_momentum_of_the_formula(turning, dt, radius):
     place, gap, steps = 0.15, 2e-4, 90
     table = dc.RigidBody.plane(1.0, motion="kinematic", friction=0.9)
     ball = dc.RigidBody.sphere(

@@ -253,7 +253,7 @@ def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thic
     assert 0.65 * reach < gap < 0.8 * reach
 
 
-def test_a_joint_needs_what_the_mass_at_its_farthest_point_needs(tmp_path):
+def test_a_joint_needs_the_stiffness_of_the_mass_at_its_farthest_point(tmp_path):
     """An arm of twice the size and equal mass has equal mass there, on four times the area."""
     found = []
     for size in (1.0, 2.0):

@@ -220,7 +220,7 @@ def test_a_saved_state_in_contact_continues_with_the_same_bits(reference):
     assert torch.equal(result.body_forces, expected.body_forces)
 
 
-def test_the_reference_depends_on_what_the_tests_change(reference):
+def test_the_reference_depends_on_the_changed_inputs(reference):
     # Each comparison above can fail: the scene reacts to gravity and the ball's motion.
     base, expected = reference
     for changes in (

@@ -128,7 +128,7 @@ def test_iterations_of_projective_dynamics_are_bounded():
 
 
 @pytest.mark.parametrize("metric", ["elastic", None])
-def test_newtons_method_takes_what_its_iterations_do_not_solve(metric):
+def test_newtons_method_solves_steps_beyond_the_iterations(metric):
     """Newton also takes over without nodal contact; the iteration limit once ended such steps."""
     solver = {"max_iterations": 30}
     sim = simulator(SCENES["stiff"](), "projective", **solver)
@@ -140,7 +140,7 @@ def test_newtons_method_takes_what_its_iterations_do_not_solve(metric):
 
 
 @pytest.mark.parametrize("force", [1e8, 1e30])
-def test_forces_beyond_what_float64_resolves_are_reported(force):
+def test_forces_beyond_the_resolution_of_float64_are_reported(force):
     sim = simulator(SCENES["free"](), "projective", max_iterations=20)
     forces = torch.zeros_like(sim.initial_state().positions)
     forces[0] = force

@@ -50,7 +50,7 @@ def test_impulses_and_velocities_obey_the_law(m, friction, condition):
 
 
 @pytest.mark.parametrize("friction", [0.3, 1.0])
-def test_newtons_method_ends_what_twenty_sweeps_began(friction):
+def test_newtons_method_completes_twenty_sweeps(friction):
     """Sweeps alone need up to eighty; the last sweep only confirms the law."""
     for seed in range(5):
         W, q, normals = contacts(40, seed, 30.0)

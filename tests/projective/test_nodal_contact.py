@@ -122,7 +122,7 @@ def test_the_normal_turns_with_the_vertex():
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("kind", ["plane", "sphere"])
-def test_projective_dynamics_finds_what_newton_finds(kind, case):
+def test_projective_dynamics_agrees_with_newton(kind, case):
     newton = on_body(kind, case, tolerance=1e-10)
     local_global = on_body(kind, case, tolerance=1e-9, elastic="projective")
     after, expected = local_global(newton.inputs), newton()
@@ -245,7 +245,7 @@ def test_stopping_distance_and_its_gradients(v_0, mu):
     assert d_friction.item() == pytest.approx(-0.5 * h * h * G * steps * (steps + 1), rel=1e-6)
 
 
-def test_nothing_holds_what_falls_straight_down_on_a_smooth_floor():
+def test_a_vertex_that_falls_straight_down_slips_on_a_smooth_floor():
     """Without friction a vertex slips even at zero slip: its tangential velocity is free."""
     sim, state, _ = patch(0.0)
     velocities = torch.zeros_like(state.velocities)
@@ -269,7 +269,7 @@ def test_a_floor_bears_the_weight_and_no_more():
 
 
 @pytest.mark.parametrize("x", [30.0, -1.5, 0.8])
-def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
+def test_a_floor_bears_cloth_beyond_its_mesh(x):
     """A plane is infinite."""
     floor = dc.RigidBody.plane(1.0, thickness=2e-3, nodal_contact=True)
     sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[x, 0.3, 9.9e-4, 1, 0, 0, 0])

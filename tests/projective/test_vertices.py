@@ -68,7 +68,7 @@ def test_gradients_of_pairs_are_those_of_differences(friction):
     assert_gradients_are_those_of_differences(value, step.inputs, sizes, generator)
 
 
-def test_self_contact_is_what_the_options_say():
+def test_options_turn_self_contact_on_and_off():
     lower, faces = grid(5, 5, seed=1, jitter=0.05)
     folded = lower.copy()
     # One half of the sheet is folded over the other, closer than the vertices' spheres.

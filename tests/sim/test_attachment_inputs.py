@@ -205,7 +205,7 @@ def test_schemes_in_stages_refuse_attached_bodies(scheme):
 
 
 @pytest.mark.parametrize("coupling", ["rigid_to_cloth", "cloth_to_rigid"])
-def test_staggered_couplings_refuse_what_forces_move(coupling):
+def test_staggered_couplings_refuse_attachments_to_dynamic_bodies(coupling):
     free = box("dynamic", mass=1.0)
     grasp = dc.Attachment(("sheet", 4), ("box", [0, 0, 0]), stiffness=3.0)
     with pytest.raises(dc.InvalidInput, match="'box', which is dynamic, needs coupling"):

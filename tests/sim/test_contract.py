@@ -459,7 +459,7 @@ def test_unset_controls_hold(sim):
     assert same(sim.step(state, explicit), after)
 
 
-def test_gradients_flow_to_what_is_held(sim):
+def test_gradients_flow_to_held_inputs(sim):
     state = moved(sim)
     x = state.positions.clone().requires_grad_()
     q = state.soft_pin_targets.clone().requires_grad_()

@@ -106,7 +106,7 @@ LOADED = """
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity of processes here")
 @pytest.mark.slow
-def test_processor_time_does_not_count_what_others_take():
+def test_processor_time_does_not_count_other_processes():
     """On one processor with two others that are busy, the wall counts three times as much."""
     processor = max(os.sched_getaffinity(0))
 

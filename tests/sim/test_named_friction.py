@@ -69,7 +69,7 @@ def test_the_gradient_is_that_of_differences(sim):
     assert mu.grad.item() == pytest.approx(slope.item(), rel=1e-6)
 
 
-def test_pairs_that_are_not_named_keep_what_the_scene_has(sim):
+def test_pairs_that_are_not_named_keep_the_friction_of_the_scene(sim):
     ordinary = slide(sim, None)
     for friction in ({}, {("mat", "far"): 0.0}, {("mat", "mat"): 0.9}):
         assert torch.equal(slide(sim, friction).positions, ordinary.positions)

@@ -62,7 +62,7 @@ def test_gradients_by_a_whole_state(simulator):
     assert expected[0].abs().max() > 0
 
 
-def test_a_control_is_a_tree_of_what_it_sets(simulator):
+def test_a_control_is_a_tree_of_its_set_fields(simulator):
     state = simulator.initial_state()
     control = dc.Control(pins={"edge": state.positions[:3] + 0.001}, wind=torch.zeros(3))
     leaves, _ = tree_flatten(control)
@@ -77,7 +77,7 @@ def test_a_control_is_a_tree_of_what_it_sets(simulator):
     assert found.wind.shape == (3,)
 
 
-def test_parameters_are_a_tree_of_what_they_set(simulator):
+def test_parameters_are_a_tree_of_their_set_fields(simulator):
     parameters = simulator.default_parameters()
     found = torch.func.grad(
         lambda p: simulator.step(simulator.initial_state(), None, p).positions.square().sum()

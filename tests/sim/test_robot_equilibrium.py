@@ -363,7 +363,7 @@ MIXED = {"shoulder": "pd", "elbow": "position"}, {"shoulder": "position", "elbow
 )
 @pytest.mark.parametrize("name", ["targets", "base", "stiffness", "gravity", "link_mass", "held"])
 @pytest.mark.parametrize("actuation", [*MIXED, "position", {**MIXED[0], "elbow": "velocity"}])
-def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, name):
+def test_derivatives_by_prescribed_joints_and_of_their_efforts(arm, actuation, name):
     dynamic = actuation != "position"
     gains = {"stiffness": 5.0, "damping": 0.1} if dynamic else {}
     start = {"shoulder": 0.3, "elbow": 0.2}

@@ -37,7 +37,7 @@ def test_a_stiff_sheet_that_turns_far_does_not_creep():
 
 
 @pytest.mark.slow
-def test_the_path_leaves_out_what_was_undone():
+def test_the_path_omits_undone_iterates():
     """In some of the throws excursions are undone; which ones depends on rounding."""
     random = np.random.default_rng(1)
     shorter = []

@@ -165,6 +165,6 @@ def test_the_distance_of_a_body_is_that_of_its_center():
         ),
     ],
 )
-def test_actions_must_fit_what_acts(short, assignment, message):
+def test_actions_must_fit_the_actuators(short, assignment, message):
     with pytest.raises(dc.InvalidInput, match=message):
         short.load(assignment)

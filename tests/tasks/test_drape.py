@@ -20,7 +20,7 @@ def test_the_tablecloth_starts_above_the_chair():
     assert task.scene.cloths[0].vertices[:, 2].min() > chair.vertices[:, 2].max()
 
 
-def test_the_meshes_of_the_configurations_are_what_their_script_makes():
+def test_meshes_of_configurations_are_the_output_of_their_script():
     made = runpy.run_path(str(CONFIGS.parent / "scripts" / "make_meshes.py"))["texts"]()
     files = {path.name: path for path in (CONFIGS / "meshes").iterdir()}
     assert set(files) == set(made)

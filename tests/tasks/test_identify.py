@@ -225,7 +225,7 @@ def test_the_second_order_step_has_less_bias_and_its_own_order(config):
         ([*FALL, "fit.extrapolate=true", "fit.trajectories.fall.kind=outline"], "of the kind"),
     ],
 )
-def test_what_cannot_be_extrapolated_is_refused(config, changes, message):
+def test_configurations_that_cannot_be_extrapolated_are_refused(config, changes, message):
     with pytest.raises(dc.InvalidInput, match=message):
         load_task(config, changes)
 
@@ -334,7 +334,7 @@ def test_the_command_writes_its_results_and_goes_on_with_the_same_bits(config, t
     assert "holds results already" in again.output
 
 
-def test_the_command_refuses_what_is_no_fit(config, tmp_path):
+def test_the_command_refuses_other_tasks_and_folders(config, tmp_path):
     result = CliRunner().invoke(main, ["fit", str(CONFIGS / "drape.yaml")])
     assert result.exit_code == 2
     assert "`task` must be identify" in result.output

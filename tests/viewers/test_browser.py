@@ -225,7 +225,7 @@ class TestPages:
         assert (np.abs(early - late)[: HEIGHT // 2] > 60).any(axis=-1).sum() > 1000
 
     @pytest.mark.slow
-    def test_colors_and_several_environments(self, falling, chromium, tmp_path):
+    def test_several_environments_stand_side_by_side_in_color(self, falling, chromium, tmp_path):
         scene, states = falling
         page = tmp_path / "strain.html"
         camera = dc.Camera(azimuth=0, elevation=60)
@@ -428,19 +428,19 @@ class TestRefused:
             ({"path": "nowhere/page.html"}, "in an existing folder"),
         ],
     )
-    def test_arguments(self, falling, arguments, message, tmp_path, monkeypatch):
+    def test_bad_arguments_are_refused(self, falling, arguments, message, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         scene, states = falling
         with pytest.raises(dc.InvalidInput, match=message):
             dc.show(scene, states, **{"path": "page.html", **arguments})
         assert not list(tmp_path.iterdir())
 
-    def test_gradients_of_another_shape(self, falling, tmp_path):
+    def test_gradients_of_another_shape_are_refused(self, falling, tmp_path):
         scene, states = falling
         with pytest.raises(dc.InvalidInput, match=r"`gradients`\[0\] must have shape \[2, 81, 3\]"):
             dc.show(scene, states[:1], tmp_path / "p.html", gradients=[torch.zeros(81, 3)])
 
-    def test_states_of_another_scene_or_batch(self, falling, tmp_path):
+    def test_states_of_another_scene_or_batch_are_refused(self, falling, tmp_path):
         scene, states = falling
         other = dc.Scene([dc.Cloth.grid(4, 4)])
         with pytest.raises(dc.InvalidInput, match=r"show: states\[0\] must be of this scene"):

@@ -322,7 +322,7 @@ def landing():
 
 @pytest.mark.usefixtures("pictures")
 class TestRender:
-    def test_the_ending_says_what_is_made(self, landing, tmp_path):
+    def test_the_ending_selects_the_kind_of_picture(self, landing, tmp_path):
         scene, states = landing
         for name in ("a.mp4", "b.gif", "c.png"):
             dc.render(scene, states, tmp_path / name, size=(160, 120))
@@ -350,7 +350,7 @@ class TestRender:
         assert reds[False] == 0
         assert reds[True] > 50
 
-    def test_arrows_are_the_forces_of_what_is_shown(self, landing, tmp_path):
+    def test_arrows_are_the_forces_on_shown_surfaces(self, landing, tmp_path):
         scene, states = landing
         pictures = Pictures(contact_forces=True, video="none")
         viewer = Record(tmp_path, scene, fps=10, pictures=pictures)
