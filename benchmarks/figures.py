@@ -464,7 +464,8 @@ def _preface(records: Records) -> str:
     before, after = records["load"]
     steps = ", ".join(f"{n} steps at {k} x {k}" for k, n in records["steps"].items())
     return f"""\
-`python -m benchmarks.figures` writes this page from `docs/{RECORDS}`: do not edit it.
+This page is for users who estimate the time of a simulation.
+`python -m benchmarks.figures` writes it from `docs/{RECORDS}`: do not edit it.
 
 Measured on {records["date"]} in {records["minutes"]:g} minutes of {clock}, on {records["cores"]}
 cores ({records["processor"]}), with one thread unless a table says otherwise.
