@@ -15,15 +15,6 @@
 namespace diffcloth::elastic {
 namespace {
 
-DIFFCLOTH_INLINE Gradient gradient_of(const double (&columns)[6][kLanes], int l) {
-  Gradient F;
-  for (int k = 0; k < 3; ++k) {
-    F.a[k] = columns[k][l];
-    F.b[k] = columns[3 + k][l];
-  }
-  return F;
-}
-
 /// sym(G^T D).
 DIFFCLOTH_INLINE Symmetric strain_along(const Gradient& G, const Gradient& D) {
   return {.uu = dot(G.a, D.a), .uv = 0.5 * (dot(G.a, D.b) + dot(G.b, D.a)), .vv = dot(G.b, D.b)};
@@ -108,10 +99,7 @@ void add_chord_gradient(const ChordBatch* batches, std::size_t count, const doub
       const double scale = batch->weight[l] * (q * (q + 2.0 * kFreeStrainSq)) / (sum * sum);
       const Gradient P = times(D, e);
       for (int k = 0; k < 3; ++k) {
-        const double a = scale * P.a[k];
-        const double b = scale * P.b[k];
-        force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
-        force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
+        put_forces(faces, k, scale * P.a[k], scale * P.b[k], l, force);
       }
     }
     scatter_forces(faces, force, g);
@@ -170,11 +158,10 @@ void add_chord_hessian(const ChordBatch* batches,
                        const double* x,
                        const std::int32_t* place,
                        double* blocks) {
-  alignas(64) double h[54][kLanes];
-  for (const ChordBatch* batch = batches; batch != batches + count; ++batch) {
-    chord_hessians(*batch, x, h);
-    scatter_blocks(batch->faces, h, place, blocks);
-  }
+  add_hessians(
+      batches, count, x, false, place, blocks,
+      [](const ChordBatch& batch) -> const FaceBatch& { return batch.faces; }, chord_hessians,
+      chord_hessians);
 }
 
 }  // namespace

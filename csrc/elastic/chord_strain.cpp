@@ -7,13 +7,12 @@
 namespace diffcloth::elastic {
 namespace {
 
-constexpr double kFree = kFreeStrainSq;
-
 /// Derivatives of phi.
 struct Law {
   explicit Law(double q)
-      : first(0.5 * q * (q + 2.0 * kFree) / ((q + kFree) * (q + kFree))),
-        second(kFree * kFree / ((q + kFree) * (q + kFree) * (q + kFree))) {}
+      : first(0.5 * q * (q + 2.0 * kFreeStrainSq) / ((q + kFreeStrainSq) * (q + kFreeStrainSq))),
+        second(kFreeStrainSq * kFreeStrainSq /
+               ((q + kFreeStrainSq) * (q + kFreeStrainSq) * (q + kFreeStrainSq))) {}
 
   double first, second;
 };
@@ -34,11 +33,6 @@ double mean_stiffness(const Model& model, const Stiffnesses& of, Index f) {
   for_each_share(model, of,
                  [&](const std::vector<double>& k, double share) { mean += share * k[f]; });
   return mean;
-}
-
-const StretchKernels& kernels_here() {
-  static const StretchKernels& kernels = stretch_kernels(linalg::chosen_level());
-  return kernels;
 }
 
 double dot(const Mat2& a, const Mat2& b) { return a.cwiseProduct(b).sum(); }
@@ -96,22 +90,22 @@ ChordStrain::Face ChordStrain::face(Index f, const double* x) const {
 }
 
 double ChordStrain::energy(const double* x) const {
-  return kernels_here().chord_energy(batches().data(), batches().size(), x);
+  return stretch_kernels().chord_energy(batches().data(), batches().size(), x);
 }
 
 double ChordStrain::energy_change(const double* x, const double* to) const {
-  return kernels_here().chord_energy_change(batches().data(), batches().size(), x, to);
+  return stretch_kernels().chord_energy_change(batches().data(), batches().size(), x, to);
 }
 
 void ChordStrain::add_gradient(const double* x, double* g) const {
-  kernels_here().add_chord_gradient(batches().data(), batches().size(), x, g);
+  stretch_kernels().add_chord_gradient(batches().data(), batches().size(), x, g);
 }
 
 void ChordStrain::add_hessian(const double* x,
                               Curvature /*curvature*/,
                               linalg::BlockMatrix& A) const {
-  kernels_here().add_chord_hessian(batches().data(), batches().size(), x, A.slot_of_base().data(),
-                                   A.blocks());
+  stretch_kernels().add_chord_hessian(batches().data(), batches().size(), x,
+                                      A.slot_of_base().data(), A.blocks());
 }
 
 void ChordStrain::add_hessian_product(const double* x, const double* z, double* y) const {

@@ -15,18 +15,9 @@
 namespace diffcloth::elastic {
 namespace {
 
-DIFFCLOTH_INLINE Gradient start_of(const DampingBatch& batch, int l) {
-  Gradient F;
-  for (int k = 0; k < 3; ++k) {
-    F.a[k] = batch.start[k][l];
-    F.b[k] = batch.start[3 + k][l];
-  }
-  return F;
-}
-
 /// C - C_n.
 DIFFCLOTH_INLINE Symmetric strain_of(const DampingBatch& batch, const Gradient& F, int l) {
-  const Gradient F_n = start_of(batch, l);
+  const Gradient F_n = gradient_of(batch.start, l);
   Gradient dF;
   for (int k = 0; k < 3; ++k) {
     dF.a[k] = F.a[k] - F_n.a[k];
@@ -46,8 +37,7 @@ DIFFCLOTH_INLINE void put_damping_force(const DampingBatch& batch,
   for (int k = 0; k < 3; ++k) {
     const double a = 0.5 * (F.a[k] * T.uu + F.b[k] * T.uv);
     const double b = 0.5 * (F.a[k] * T.uv + F.b[k] * T.vv);
-    force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
-    force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
+    put_forces(faces, k, a, b, l, force);
   }
 }
 

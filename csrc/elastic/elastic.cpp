@@ -89,11 +89,6 @@ std::size_t bytes(const Prepared& p) {
          bytes(p.bent.points) + bytes(p.bent.elements) + bytes(p.woven);
 }
 
-const StretchKernels& stretch_here() {
-  static const StretchKernels& best = stretch_kernels(linalg::chosen_level());
-  return best;
-}
-
 const BendingKernels& bending_here() {
   static const BendingKernels& best = bending_kernels(linalg::chosen_level());
   return best;
@@ -290,13 +285,14 @@ double bending_energy(const Model& model, const double* x) {
 double energy_change(const Model& model, const double* x0, const double* x1, double* g1) {
   const Prepared& prepared = *model.prepared;
   double total =
-      stretch_here().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1, g1);
-  total += stretch_here().woven_energy_change(prepared.woven.data(), prepared.woven.size(), x0, x1);
+      stretch_kernels().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1, g1);
+  total +=
+      stretch_kernels().woven_energy_change(prepared.woven.data(), prepared.woven.size(), x0, x1);
   if (g1 != nullptr) {
-    stretch_here().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x1, g1);
+    stretch_kernels().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x1, g1);
   }
-  total += stretch_here().damping_energy_change(prepared.damping_of_stretch.data(),
-                                                prepared.damping_of_stretch.size(), x0, x1, g1);
+  total += stretch_kernels().damping_energy_change(prepared.damping_of_stretch.data(),
+                                                   prepared.damping_of_stretch.size(), x0, x1, g1);
   total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
                                         prepared.bent.points.data(), x0, x1, g1);
   for_stiff_elements(model, [&](const bending::Element& element) {
@@ -308,10 +304,10 @@ double energy_change(const Model& model, const double* x0, const double* x1, dou
 
 void add_gradient(const Model& model, const double* x, double* g) {
   const Prepared& prepared = *model.prepared;
-  stretch_here().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
-  stretch_here().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x, g);
-  stretch_here().add_damping_gradient(prepared.damping_of_stretch.data(),
-                                      prepared.damping_of_stretch.size(), x, g);
+  stretch_kernels().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
+  stretch_kernels().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x, g);
+  stretch_kernels().add_damping_gradient(prepared.damping_of_stretch.data(),
+                                         prepared.damping_of_stretch.size(), x, g);
   bending_here().add_gradient(prepared.bent.batches.data(), prepared.bent.batches.size(),
                               prepared.bent.points.data(), x, g);
   for_stiff_elements(
@@ -333,13 +329,13 @@ void add_hessian(const Model& model,
     block[4] += value;
     block[8] += value;
   }
-  stretch_here().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive,
-                             place.data(), blocks);
-  stretch_here().add_woven_hessian(prepared.woven.data(), prepared.woven.size(), x, positive,
-                                   place.data(), blocks);
-  stretch_here().add_damping_hessian(prepared.damping_of_stretch.data(),
-                                     prepared.damping_of_stretch.size(), x, positive, place.data(),
-                                     blocks);
+  stretch_kernels().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive,
+                                place.data(), blocks);
+  stretch_kernels().add_woven_hessian(prepared.woven.data(), prepared.woven.size(), x, positive,
+                                      place.data(), blocks);
+  stretch_kernels().add_damping_hessian(prepared.damping_of_stretch.data(),
+                                        prepared.damping_of_stretch.size(), x, positive,
+                                        place.data(), blocks);
   bending_here().add_hessian(prepared.bent.batches.data(), prepared.bent.batches.size(),
                              prepared.bent.points.data(), x, positive, place.data(), blocks);
 }

@@ -75,6 +75,23 @@ DIFFCLOTH_INLINE Gradient gradient(const FaceBatch& batch, const Sides& sides, i
   return F;
 }
 
+/// A gradient that a batch stores, column by column.
+DIFFCLOTH_INLINE Gradient gradient_of(const double (&columns)[6][kLanes], int l) {
+  Gradient F;
+  for (int k = 0; k < 3; ++k) {
+    F.a[k] = columns[k][l];
+    F.b[k] = columns[3 + k][l];
+  }
+  return F;
+}
+
+/// Forces of a triangle on its corners 1 and 2, from component k of its stress, columns a and b.
+DIFFCLOTH_INLINE void put_forces(
+    const FaceBatch& batch, int k, double a, double b, int l, double (&force)[6][kLanes]) {
+  force[k][l] = a * batch.g[0][l] + b * batch.g[1][l];
+  force[3 + k][l] = a * batch.g[2][l] + b * batch.g[3][l];
+}
+
 /// Add forces on corners 1 and 2, and their reaction on corner 0.
 DIFFCLOTH_INLINE void scatter_forces(const FaceBatch& batch,
                                      const double (&force)[6][kLanes],

@@ -115,9 +115,8 @@ void add_stretch_blocks(const Model& model,
   put_start_gradients(damped, faces, batches);
   std::vector<Index> place(blocks.size() / 9);
   std::iota(place.begin(), place.end(), 0);
-  static const StretchKernels& kernels = stretch_kernels(linalg::chosen_level());
-  kernels.add_damping_hessian(batches.data(), batches.size(), u, false, place.data(),
-                              blocks.data());
+  stretch_kernels().add_damping_hessian(batches.data(), batches.size(), u, false, place.data(),
+                                        blocks.data());
 }
 
 }  // namespace

@@ -17,4 +17,9 @@ const StretchKernels& stretch_kernels(linalg::KernelLevel level) {
   return kPortableStretchLanes;
 }
 
+const StretchKernels& stretch_kernels() {
+  static const StretchKernels& best = stretch_kernels(linalg::chosen_level());
+  return best;
+}
+
 }  // namespace diffcloth::elastic

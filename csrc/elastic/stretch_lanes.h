@@ -168,4 +168,7 @@ struct StretchKernels {
 /// @throws std::invalid_argument  if this processor or build has no kernels of that level
 const StretchKernels& stretch_kernels(linalg::KernelLevel level);
 
+/// The kernels of linalg::chosen_level().
+const StretchKernels& stretch_kernels();
+
 }  // namespace diffcloth::elastic

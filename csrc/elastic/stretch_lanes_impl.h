@@ -40,8 +40,7 @@ DIFFCLOTH_INLINE void put_force(const StretchBatch& batch,
   for (int k = 0; k < 3; ++k) {
     const double a = batch.weight[l] * (F.a[k] - p.r1[k]);
     const double b = batch.weight[l] * (F.b[k] - p.r2[k]);
-    force[k][l] = a * batch.faces.g[0][l] + b * batch.faces.g[1][l];
-    force[3 + k][l] = a * batch.faces.g[2][l] + b * batch.faces.g[3][l];
+    put_forces(batch.faces, k, a, b, l, force);
   }
 }
 

@@ -108,8 +108,7 @@ void add_woven_gradient(const WovenBatch* batches, std::size_t count, const doub
       for (int k = 0; k < 3; ++k) {
         const double a = K.shear * (F.a[k] - p.r1[k]) + of_warp * F.a[k];
         const double b = K.shear * (F.b[k] - p.r2[k]) + of_weft * F.b[k];
-        force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
-        force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
+        put_forces(faces, k, a, b, l, force);
       }
     }
     scatter_forces(faces, force, g);
