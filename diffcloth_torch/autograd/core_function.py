@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from inspect import signature
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +21,16 @@ from diffcloth_torch.autograd.linear_map import LinearMap, apply_map
 from diffcloth_torch.autograd.transforms import numbers_of, same_rows
 from diffcloth_torch.errors import InvalidInput, SimulationError
 
-__all__ = ["Arrays", "CoreFunction", "as_array", "evaluate", "failing_as"]
+__all__ = [
+    "NO_CONSTANTS",
+    "Arrays",
+    "Constant",
+    "CoreFunction",
+    "as_array",
+    "evaluate",
+    "failing_as",
+    "without_constants",
+]
 
 Arrays = dict[str, NDArray[np.float64]]
 
@@ -27,6 +38,34 @@ Arrays = dict[str, NDArray[np.float64]]
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
     """Return a contiguous array of a tensor's numbers; shares its memory if possible."""
     return np.ascontiguousarray(numbers_of(tensor))
+
+
+class Constant(NamedTuple):
+    """An input that cannot be edited from outside, and that needs no gradient.
+
+    Attributes:
+        tensor: The tensor that identifies it.
+        array: Its numbers.
+    """
+
+    tensor: Tensor
+    array: NDArray[np.float64]
+
+    @staticmethod
+    def of(tensor: Tensor) -> Constant:
+        """Make the constant of a tensor."""
+        return Constant(tensor, as_array(tensor))
+
+
+NO_CONSTANTS: Mapping[str, Constant] = MappingProxyType({})
+
+
+def without_constants(
+    inputs: Mapping[str, Tensor], constants: Mapping[str, Constant]
+) -> tuple[Arrays, dict[str, Tensor]]:
+    """Split inputs into arrays of the constants among them, and all other inputs."""
+    known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
+    return known, {n: tensor for n, tensor in inputs.items() if n not in known}
 
 
 @contextmanager

@@ -39,10 +39,11 @@ __all__ = [
 _functorch = torch._C._functorch
 
 
-def in_transform() -> bool:
-    """Return true inside a transform of `torch.func` or `torch.vmap`."""
-    active: bool = torch._C._are_functorch_transforms_active()
-    return active
+# These two are called for each tensor of each step: they are torch's own functions.
+in_transform: Callable[[], bool] = torch._C._are_functorch_transforms_active
+"""Return true inside a transform of `torch.func` or `torch.vmap`."""
+is_wrapped: Callable[[Tensor], bool] = _functorch.is_functorch_wrapped_tensor
+"""Return true for the wrapper of a transform, which has no memory of its own."""
 
 
 def transforms() -> list[bool]:
@@ -60,12 +61,6 @@ def with_tangents() -> AbstractContextManager[None]:
     """Allow tangents inside of the `jvp` of a Function, where torch computes none by default."""
     enabled: AbstractContextManager[None] = forward_ad._set_fwd_grad_enabled(True)
     return enabled
-
-
-def is_wrapped(tensor: Tensor) -> bool:
-    """Return true for the wrapper of a transform, which has no memory of its own."""
-    wrapped: bool = _functorch.is_functorch_wrapped_tensor(tensor)
-    return wrapped
 
 
 def unwrap(tensor: Tensor) -> tuple[Tensor, int | None]:

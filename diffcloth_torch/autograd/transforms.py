@@ -17,7 +17,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch.autograd import torch_private
-from diffcloth_torch.autograd.torch_private import outside_transforms
+from diffcloth_torch.autograd.torch_private import (
+    in_forward_mode,
+    in_transform,
+    is_wrapped,
+    outside_transforms,
+)
 
 __all__ = [
     "has_derivative",
@@ -42,7 +47,7 @@ def is_dense(value: Tensor) -> bool:
 
 def is_plain(tensor: Tensor) -> bool:
     """Return whether a tensor has memory of its own: no transform is active."""
-    return not torch_private.is_wrapped(tensor)
+    return not is_wrapped(tensor)
 
 
 def plain(tensor: Tensor) -> Tensor:
@@ -85,8 +90,8 @@ def _same_row(tensor: Tensor, axis: int) -> Tensor:
 
 def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
     """Return an array of a tensor's numbers; shares its memory, without its graph."""
-    if is_plain(tensor) and not torch_private.in_transform():
-        return tensor.detach().numpy()
+    if not is_wrapped(tensor) and not in_transform():
+        return (tensor.detach() if tensor.requires_grad else tensor).numpy()
     value = plain(tensor)
     with outside_transforms():
         return value.numpy()
@@ -122,11 +127,11 @@ def is_differentiated(tensors: Iterable[Tensor]) -> bool:
     tensors = list(tensors)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         return True
-    if not all(map(is_plain, tensors)):
+    if any(map(is_wrapped, tensors)):
         return True
-    return any(map(_has_tangent, tensors))
+    return in_forward_mode() and any(map(_has_tangent, tensors))
 
 
 def _has_tangent(tensor: Tensor) -> bool:
     unpack: Any = forward_ad.unpack_dual
-    return torch_private.in_forward_mode() and unpack(tensor).tangent is not None
+    return in_forward_mode() and unpack(tensor).tangent is not None

@@ -10,11 +10,12 @@ momentum of the body after the step: contact conserves the total momentum.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from torch import Tensor
 
+from diffcloth_torch.autograd.core_function import NO_CONSTANTS, Constant
 from diffcloth_torch.dynamics.functions import body_functions, outputs_of
 from diffcloth_torch.dynamics.inertia import rigid_totals
 from diffcloth_torch.dynamics.totals import Totals
@@ -58,6 +59,7 @@ class BodyPrediction(NamedTuple):
         momentum: Angular momentum without contact, [B, K, 3].
         speed: Speed of rotation at the start with that momentum, [B, K] rad/s.
         inputs: Masses, centers, inertias and poses at the start, as for the core's functions.
+        constants: Constants among them.
     """
 
     frames: Tensor
@@ -67,6 +69,7 @@ class BodyPrediction(NamedTuple):
     momentum: Tensor
     speed: Tensor
     inputs: dict[str, Tensor]
+    constants: Mapping[str, Constant]
 
 
 def predict_bodies(
@@ -77,6 +80,7 @@ def predict_bodies(
     gravity: Tensor,
     dt: float,
     names: Sequence[str] = (),
+    constants: Mapping[str, Constant] = NO_CONSTANTS,
 ) -> BodyPrediction:
     """Predict a step without contact.
 
@@ -88,6 +92,7 @@ def predict_bodies(
         gravity: [B or 1, 3] m/s^2.
         dt: h [s].
         names: Names of the bodies, for messages.
+        constants: As for `outputs_of`.
     """
     shared = {
         "mass": inertia.mass,
@@ -97,12 +102,12 @@ def predict_bodies(
     }
     own = {"velocities": velocities, "wrenches": wrenches, "gravity": gravity}
     prediction, _ = body_functions(poses.shape[-2], dt)
-    found = outputs_of(prediction, shared | own)
+    found = outputs_of(prediction, shared | own, constants)
     speed = found.pop("speed").detach()
     is_found = found.pop("found").detach() > 0
     if not is_found.all():
         _refuse_turns(~is_found, speed, dt, names)
-    return BodyPrediction(**found, speed=speed, inputs=shared)
+    return BodyPrediction(**found, speed=speed, inputs=shared, constants=constants)
 
 
 def turn_sentence(name: str, speed: float, dt: float, most: float, how: str) -> str:
@@ -164,5 +169,5 @@ def advance_bodies(
     }
     if kick is not None:
         own["kick"] = kick
-    found = outputs_of(advance, prediction.inputs | own)
+    found = outputs_of(advance, prediction.inputs | own, prediction.constants)
     return found["poses"], found["velocities"]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.core_function import NO_CONSTANTS, Constant
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.bodies import (
     MOST_TURN_IN_CONTACT,
@@ -40,6 +42,25 @@ from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.quantities import Fields
 
 __all__ = ["Dynamics", "Prediction"]
+
+# Fields of parameters that bodies and robots have.
+_FIELDS = (
+    "gravity",
+    "body_mass",
+    "body_center",
+    "body_inertia",
+    "link_mass",
+    "link_center",
+    "link_inertia",
+    "joint_armature",
+    "joint_stiffness",
+    "joint_damping",
+    "joint_viscosity",
+    "joint_effort_limits",
+    "joint_velocity_limits",
+    "joint_friction",
+    "joint_slip_rates",
+)
 
 _forked = False
 
@@ -102,8 +123,46 @@ class Prediction:
         }
 
 
+class _RobotParameters(NamedTuple):
+    """Parameters of a robot; `bounds` is None if no joint of the scene is moved by forces."""
+
+    inertia: Inertia
+    gains: Gains
+    bounds: Bounds | None
+
+
+class _Parameters(NamedTuple):
+    """Parameters of all bodies and robots.
+
+    Attributes:
+        gravity: [B or 1, 3] m/s^2.
+        bodies: Inertia of the dynamic bodies; None if there are none.
+        robots: For each robot its parameters.
+    """
+
+    gravity: Tensor
+    bodies: BodyInertia | None
+    robots: list[_RobotParameters]
+
+
+class _Kept(NamedTuple):
+    """Parameters of the scene, which are prepared once.
+
+    Attributes:
+        fields: The fields of parameters; None for a field that the scene lacks.
+        parameters: The same for bodies and robots.
+        of_bodies: Constants of the core's functions of bodies.
+        of_robots: For each robot the constants of its functions.
+    """
+
+    fields: dict[str, Tensor | None]
+    parameters: _Parameters
+    of_bodies: Mapping[str, Constant]
+    of_robots: list[Mapping[str, Constant]]
+
+
 class Dynamics:
-    """Predicts and advances the bodies and robots of a scene. Immutable.
+    """Predicts and advances the bodies and robots of a scene. Immutable once parameters are kept.
 
     Attributes:
         dt: Time step [s].
@@ -158,6 +217,28 @@ class Dynamics:
             held.append(robot.prescribed)
         self.prescribed = torch.cat(held)
         self.coordinate_count = len(self.prescribed)
+        self._kept: _Kept | None = None
+
+    def keep(self, parameters: Fields) -> None:
+        """Prepare the parameters of the scene; nobody may edit these tensors.
+
+        Steps with these very tensors do not prepare them again.
+
+        Args:
+            parameters: As for `predict`, without gradients.
+        """
+        own = self._prepared(parameters)
+        of_bodies = {} if own.bodies is None else own.bodies._asdict() | {"gravity": own.gravity}
+        of_robots = [
+            robot.parameters(*parts, own.gravity)
+            for robot, parts in zip(self._robots, own.robots, strict=True)
+        ]
+        self._kept = _Kept(
+            fields={name: parameters.get(name) for name in _FIELDS},
+            parameters=own,
+            of_bodies=_constants(of_bodies),
+            of_robots=[_constants(named) for named in of_robots],
+        )
 
     def predict(
         self,
@@ -184,12 +265,14 @@ class Dynamics:
             # forever.
             torch.set_num_threads(1)
         batch = len(state["body_poses"])
-        now = {name: values.expand(batch, *values.shape[1:]) for name, values in state.items()}
-        acting = {name: values.expand(batch, *values.shape[1:]) for name, values in control.items()}
-        gravity = parameters["gravity"].reshape(-1, 3)
+        acting = {
+            name: values if len(values) == batch else values.expand(batch, *values.shape[1:])
+            for name, values in control.items()
+        }
+        own = self._own_parameters(parameters)
 
-        bodies = self._predict_bodies(now, acting, parameters, gravity, contact)
-        start, end = now["body_poses"], acting["body_poses"]
+        bodies = self._predict_bodies(state, acting, own, contact)
+        start, end = state["body_poses"], acting["body_poses"]
         velocities = row_velocities(start, end, self._moved, self.dt)
         held = end
         if bodies is not None:
@@ -197,27 +280,27 @@ class Dynamics:
             start = start.index_copy(1, self._free, bodies.frames)
             end = end.index_copy(1, self._free, bodies.frames)
         robots = tuple(
-            self._predict_robot(i, now, acting, parameters, gravity, contact, joint_origins)
+            self._predict_robot(i, state, acting, own, contact, joint_origins)
             for i in range(len(self._robots))
         )
         none = start.new_zeros(batch, 0)
 
         def rows(of_bodies: Tensor | None, of_robots: Iterable[Tensor]) -> Tensor:
             first = none if of_bodies is None else of_bodies.flatten(1)
-            return torch.cat([first, *(t.flatten(1) for t in of_robots)], dim=1)
+            return _joined([first, *(t.flatten(1) for t in of_robots)])
 
         b = bodies
         terms = [c.terms for c in robots if c.terms is not None]
         if terms:
             terms.insert(0, _idle_terms(terms[0], self._widths[0]))
         return Prediction(
-            body_poses=torch.cat([start, *(c.root_start[:, None] for c in robots)], dim=1),
-            body_targets=torch.cat([end, *(c.root_end[:, None] for c in robots)], dim=1),
+            body_poses=_joined([start, *(c.root_start[:, None] for c in robots)]),
+            body_targets=_joined([end, *(c.root_end[:, None] for c in robots)]),
             coordinates=rows(b and b.coordinates, (c.coordinates for c in robots)),
             coordinate_ends=rows(b and b.coordinates, (c.ends for c in robots)),
             coordinate_targets=rows(b and b.target, (c.target for c in robots)),
             coordinate_metric=rows(b and b.metric, (c.metric for c in robots)),
-            joint_terms=torch.cat(terms, dim=1) if terms else None,
+            joint_terms=_joined(terms) if terms else None,
             bodies=bodies,
             robots=robots,
             held_poses=held,
@@ -322,9 +405,9 @@ class Dynamics:
         for i, robot in enumerate(self._robots):
             rows = self._robot_rows[i][2]
             pushed = None if kick is None else kick[:, rows]
-            after, effort = robot.advance(
-                prediction.robots[i], parts[1 + i], contact[:, rows], pushed
-            )
+            # The rows ascend: if they are as many as all, they are all.
+            touched = contact if len(rows) == contact.shape[1] else contact[:, rows]
+            after, effort = robot.advance(prediction.robots[i], parts[1 + i], touched, pushed)
             states.append(after)
             efforts.append(effort)
         none = coordinates.new_zeros(batch, 0)
@@ -332,13 +415,11 @@ class Dynamics:
         return {
             "body_poses": poses,
             "body_velocities": velocities,
-            "joint_positions": torch.cat([none, *(s.joints for s in states)], dim=1),
-            "joint_velocities": torch.cat([none, *(s.rates for s in states)], dim=1),
-            "joint_efforts": torch.cat([none, *efforts], dim=1),
-            "base_poses": torch.cat([bases, *(s.pose[:, None] for s in states)], dim=1),
-            "base_velocities": torch.cat(
-                [bases[..., :6], *(s.velocity[:, None] for s in states)], dim=1
-            ),
+            "joint_positions": _joined([none, *(s.joints for s in states)]),
+            "joint_velocities": _joined([none, *(s.rates for s in states)]),
+            "joint_efforts": _joined([none, *efforts]),
+            "base_poses": _joined([bases, *(s.pose[:, None] for s in states)]),
+            "base_velocities": _joined([bases[..., :6], *(s.velocity[:, None] for s in states)]),
         }
 
     def too_fast(self, prediction: Prediction) -> dict[int, str]:
@@ -441,42 +522,26 @@ class Dynamics:
         return RobotState(
             pose=state["base_poses"][:, i],
             velocity=state["base_velocities"][:, i],
-            joints=state["joint_positions"][:, joints],
-            rates=state["joint_velocities"][:, joints],
+            joints=_part(state["joint_positions"], joints),
+            rates=_part(state["joint_velocities"], joints),
         )
 
-    def _predict_bodies(
-        self,
-        state: Fields,
-        control: Fields,
-        parameters: Fields,
-        gravity: Tensor,
-        contact: Tensor | None,
-    ) -> BodyPrediction | None:
-        free = self._free
-        if not len(free):
-            return None
-        poses, velocities = state["body_poses"][:, free], state["body_velocities"][:, free]
-        wrenches = control["body_wrenches"][:, free]
-        inertia = self._body_inertia(parameters)
-        if contact is not None:
-            turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
-            wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
-        return predict_bodies(
-            poses, velocities, inertia, wrenches, gravity, self.dt, self._free_names
+    def _own_parameters(self, parameters: Fields) -> _Parameters:
+        """Parameters of bodies and robots; these of the scene are prepared."""
+        kept = self._kept
+        if kept is not None and all(parameters.get(n) is t for n, t in kept.fields.items()):
+            return kept.parameters
+        return self._prepared(parameters)
+
+    def _prepared(self, parameters: Fields) -> _Parameters:
+        return _Parameters(
+            gravity=parameters["gravity"].reshape(-1, 3),
+            bodies=self._body_inertia(parameters) if len(self._free) else None,
+            robots=[self._robot_parameters(i, parameters) for i in range(len(self._robots))],
         )
 
-    def _predict_robot(
-        self,
-        i: int,
-        state: Fields,
-        control: Fields,
-        parameters: Fields,
-        gravity: Tensor,
-        contact: Tensor | None,
-        origins: Tensor | None,
-    ) -> RobotPrediction:
-        joints, _, vertices = self._robot_rows[i]
+    def _robot_parameters(self, i: int, parameters: Fields) -> _RobotParameters:
+        joints = self._robot_rows[i][0]
         bounds = None
         if "joint_effort_limits" in parameters:  # present if any joint is moved by forces
             bounds = Bounds(
@@ -490,21 +555,62 @@ class Dynamics:
             damping=_rows(parameters, "joint_damping", joints),
             viscosity=_rows(parameters, "joint_viscosity", joints),
         )
+        return _RobotParameters(self._robot_inertia(i, parameters), gains, bounds)
+
+    def _predict_bodies(
+        self,
+        state: Fields,
+        control: Fields,
+        parameters: _Parameters,
+        contact: Tensor | None,
+    ) -> BodyPrediction | None:
+        inertia = parameters.bodies
+        if inertia is None:
+            return None
+        free = self._free
+        poses, velocities = state["body_poses"][:, free], state["body_velocities"][:, free]
+        wrenches = control["body_wrenches"][:, free]
+        if contact is not None:
+            turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
+            wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
+        return predict_bodies(
+            poses,
+            velocities,
+            inertia,
+            wrenches,
+            parameters.gravity,
+            self.dt,
+            self._free_names,
+            NO_CONSTANTS if self._kept is None else self._kept.of_bodies,
+        )
+
+    def _predict_robot(
+        self,
+        i: int,
+        state: Fields,
+        control: Fields,
+        parameters: _Parameters,
+        contact: Tensor | None,
+        origins: Tensor | None,
+    ) -> RobotPrediction:
+        joints, _, vertices = self._robot_rows[i]
+        inertia, gains, bounds = parameters.robots[i]
         return self._robots[i].predict(
             self._robot_state(i, state),
             RobotControl(
                 pose=control["base_poses"][:, i],
                 wrench=control["base_wrenches"][:, i],
-                joints=control["joint_positions"][:, joints],
-                rates=control["joint_velocities"][:, joints],
-                efforts=control["joint_efforts"][:, joints],
+                joints=_part(control["joint_positions"], joints),
+                rates=_part(control["joint_velocities"], joints),
+                efforts=_part(control["joint_efforts"], joints),
             ),
-            self._robot_inertia(i, parameters),
+            inertia,
             gains,
-            gravity,
+            parameters.gravity,
             None if contact is None else contact[:, vertices],
             bounds,
             None if origins is None else origins[:, joints],
+            NO_CONSTANTS if self._kept is None else self._kept.of_robots[i],
         )
 
     def _wrenches(self, quaternions: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
@@ -518,6 +624,21 @@ class Dynamics:
 
 def _indices(values: Iterable[int]) -> Tensor:
     return cpu.tensor(list(values), dtype=torch.long)
+
+
+def _constants(named: Mapping[str, Tensor]) -> dict[str, Constant]:
+    return {name: Constant.of(tensor) for name, tensor in named.items()}
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate parts along the second axis; the only part with rows is not copied."""
+    some = [part for part in parts if part.shape[1]]
+    return some[0] if len(some) == 1 else torch.cat(list(parts), dim=1)
+
+
+def _part(values: Tensor, rows: slice) -> Tensor:
+    """Rows of the second axis of values [B, n]."""
+    return values if rows == slice(0, values.shape[1]) else values[:, rows]
 
 
 def _idle_terms(like: Tensor, count: int) -> Tensor:

@@ -15,7 +15,15 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
-from diffcloth_torch.autograd.core_function import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.autograd.core_function import (
+    NO_CONSTANTS,
+    Arrays,
+    Constant,
+    CoreFunction,
+    as_array,
+    evaluate,
+    without_constants,
+)
 from diffcloth_torch.autograd.transforms import is_differentiated
 from diffcloth_torch.model.kinematics import core_tree
 from diffcloth_torch.model.mechanism import Mechanism
@@ -73,47 +81,58 @@ def robot_functions(
     )
 
 
-def outputs_of(function: _core.SmoothFunction, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def outputs_of(
+    function: _core.SmoothFunction,
+    inputs: Mapping[str, Tensor],
+    constants: Mapping[str, Constant] = NO_CONSTANTS,
+) -> dict[str, Tensor]:
     """Return outputs [B, ...] by their names, with a graph if an input has one.
 
     Args:
         function: The function.
         inputs: Its arrays [B or 1, ...] by their names, without optional ones that are not given.
+        constants: Constants of the scene: an input that is one of these very tensors bypasses
+            autograd.
     """
     note_caller()
-    if not is_differentiated(inputs.values()):
-        arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
+    known, given = without_constants(inputs, constants)
+    if not is_differentiated(given.values()):
+        arrays = known | {name: as_array(tensor) for name, tensor in given.items()}
         values = function.values(arrays, _threads(arrays.values()))
         return {name: torch.from_numpy(array) for name, array in values.items()}
-    operation = _Operation(function, tuple(inputs))
-    results = evaluate(operation, tuple(inputs.values()))
+    operation = _Operation(function, known, tuple(given))
+    results = evaluate(operation, tuple(given.values()))
     return dict(zip(operation.outputs, results, strict=True))
 
 
 class _Operation(CoreFunction):
     owner = "step"
 
-    def __init__(self, function: _core.SmoothFunction, names: tuple[str, ...]) -> None:
+    def __init__(
+        self, function: _core.SmoothFunction, constants: Arrays, names: tuple[str, ...]
+    ) -> None:
         super().__init__(names)
-        self._function = function
+        self._function, self._constants = function, constants
         self.outputs: tuple[str, ...] = ()
 
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
-        values = self._function.values(inputs, _threads(inputs.values()))
+        every = self._constants | inputs
+        values = self._function.values(every, _threads(every.values()))
         self.outputs = tuple(values)
         return tuple(torch.from_numpy(array) for array in values.values())
 
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
-        threads = _threads(inputs.values())
-        tangents = self._function.tangents(inputs, given, count, threads)
+        every = self._constants | inputs
+        tangents = self._function.tangents(every, given, count, _threads(every.values()))
         return [torch.from_numpy(tangents[name]) for name in self.outputs]
 
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
     ) -> list[Tensor]:
         given = dict(zip(self.outputs, map(as_array, cotangents), strict=True))
-        losses, threads = len(cotangents[0]), _threads(inputs.values())
-        gradients = self._function.gradients(inputs, given, losses, needs, threads)
+        every, losses = self._constants | inputs, len(cotangents[0])
+        threads = _threads(every.values())
+        gradients = self._function.gradients(every, given, losses, needs, threads)
         return [
             torch.from_numpy(gradients[name]).reshape(losses, *inputs[name].shape) for name in needs
         ]

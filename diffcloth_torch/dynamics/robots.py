@@ -52,6 +52,7 @@ M/h^2: see csrc/bodies/weight_stiffness.h.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.core_function import NO_CONSTANTS, Constant
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.functions import outputs_of, robot_functions
 from diffcloth_torch.dynamics.inertia import ROOT, Inertia, rigid_totals
@@ -153,6 +155,7 @@ class RobotPrediction(NamedTuple):
         lost: Mask of environments without such a motion, as the robot is too fast for the time
             step; the robot then stays in place; [B].
         inputs: Arrays that the core's functions of prediction and `advance` share.
+        constants: Constants among them.
     """
 
     root_start: Tensor
@@ -167,6 +170,7 @@ class RobotPrediction(NamedTuple):
     given: Tensor
     lost: Tensor
     inputs: dict[str, Tensor]
+    constants: Mapping[str, Constant]
 
 
 class RobotDynamics:
@@ -224,6 +228,7 @@ class RobotDynamics:
         contact: Tensor | None = None,
         bounds: Bounds | None = None,
         origins: Tensor | None = None,
+        constants: Mapping[str, Constant] = NO_CONSTANTS,
     ) -> RobotPrediction:
         """Predict a step without contact, limits and drives of the joints.
 
@@ -237,16 +242,11 @@ class RobotDynamics:
             bounds: Limits and friction of the joints; None if no joint of the scene can have any.
             origins: Values of the joints from which friction measures motion, [B, J]; by default
                 the values at the start.
+            constants: As for `outputs_of`: `parameters` of the scene.
         """
-        inertia = inertia if self._own_inertia is None else self._own_inertia
+        of_both, of_prediction = self._named(inertia, gains, bounds, gravity)
         shared = {
-            "mass": inertia.mass,
-            "center": inertia.center,
-            "inertia": inertia.inertia,
-            "armature": inertia.armature,
-            "stiffness": gains.stiffness,
-            "damping": gains.damping,
-            "viscosity": gains.viscosity,
+            **of_both,
             "targets": control.joints,
             "target_rates": control.rates,
             "efforts": control.efforts,
@@ -258,25 +258,41 @@ class RobotDynamics:
             "rates": state.rates,
             "end_pose": control.pose,
             "wrench": control.wrench,
-            "gravity": gravity,
+            **of_prediction,
         }
         if contact is not None:
             own["contact"] = contact
-        if bounds is not None:
-            shared["effort_limits"] = bounds.efforts
-            own["velocity_limits"] = bounds.velocities
-            own["friction"] = bounds.friction
-            own["slip_rates"] = bounds.slip_rates
         if origins is not None:
             own["origins"] = origins
-        found = outputs_of(self._prediction, shared | own)
+        found = outputs_of(self._prediction, shared | own, constants)
         terms, lost = found.pop("terms"), found.pop("lost")
         return RobotPrediction(
             **found,
             terms=None if bounds is None else terms,
             lost=lost.detach() > 0,
             inputs=shared,
+            constants=constants,
         )
+
+    def parameters(
+        self, inertia: Inertia, gains: Gains, bounds: Bounds | None, gravity: Tensor
+    ) -> dict[str, Tensor]:
+        """Parameters by the names of the core's functions; arguments as for `predict`."""
+        of_both, of_prediction = self._named(inertia, gains, bounds, gravity)
+        return of_both | of_prediction
+
+    def _named(
+        self, inertia: Inertia, gains: Gains, bounds: Bounds | None, gravity: Tensor
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Parameters of both functions of the core, and further ones of the prediction."""
+        inertia = inertia if self._own_inertia is None else self._own_inertia
+        of_both, of_prediction = {**inertia._asdict(), **gains._asdict()}, {"gravity": gravity}
+        if bounds is not None:
+            of_both["effort_limits"] = bounds.efforts
+            of_prediction["velocity_limits"] = bounds.velocities
+            of_prediction["friction"] = bounds.friction
+            of_prediction["slip_rates"] = bounds.slip_rates
+        return of_both, of_prediction
 
     def end_at(self, prediction: RobotPrediction, pose: Tensor) -> RobotPrediction:
         """Change a prediction so that a prescribed base ends at another pose, [B, 7]."""
@@ -315,7 +331,7 @@ class RobotDynamics:
         }
         if kick is not None:
             own["kick"] = kick
-        found = outputs_of(self._advance, prediction.inputs | own)
+        found = outputs_of(self._advance, prediction.inputs | own, prediction.constants)
         joints = coordinates[..., self.coordinate_count - self.mechanism.joint_count :]
         after = RobotState(found["pose"], found["velocity"], joints, found["rates"])
         return after, found["efforts"]

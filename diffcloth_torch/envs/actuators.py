@@ -26,7 +26,7 @@ from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.records.state import State
 
-__all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocities", "moved"]
+__all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocities", "path_of"]
 
 Tools = dict[str, Tensor]
 """State of an actuator between transitions, [B, ...] each."""
@@ -263,11 +263,8 @@ class Twist(Actuator):
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
         """Move the body; see `Actuator`."""
-        pose, controls = state.body_poses[:, self._row], []
-        for _ in range(substeps):
-            pose = moved(pose, self._dt * self.speeds * actions)
-            controls.append(Control(body_poses={self._body: pose}))
-        return controls, tools
+        poses = path_of(state.body_poses[:, self._row], self._dt * self.speeds * actions, substeps)
+        return [Control(body_poses={self._body: pose}) for pose in poses], tools
 
 
 class Hand(Actuator):
@@ -300,15 +297,25 @@ class Hand(Actuator):
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
         """Move the base and pull at the joints; see `Actuator`."""
-        pose, controls = state.base_poses[:, 0], []
+        twist = self._dt * self.speeds * actions[:, :6]
         efforts = dict.fromkeys(self._joints, self.effort * actions[:, 6])
-        for _ in range(substeps):
-            pose = moved(pose, self._dt * self.speeds * actions[:, :6])
-            controls.append(Control(base_poses={self._robot: pose}, joint_efforts=efforts))
-        return controls, tools
+        return [
+            Control(base_poses={self._robot: pose}, joint_efforts=efforts)
+            for pose in path_of(state.base_poses[:, 0], twist, substeps)
+        ], tools
 
 
-def moved(pose: Tensor, twist: Tensor) -> Tensor:
-    """Poses [B, 7] displaced by twists [B, 6]: translations [m] and rotation vectors [rad]."""
-    turned = quaternion_multiply(quaternion_exp(twist[:, 3:]), pose[:, 3:])
-    return torch.cat([pose[:, :3] + twist[:, :3], turned], dim=-1)
+def path_of(pose: Tensor, twist: Tensor, steps: int) -> list[Tensor]:
+    """Poses [B, 7] after each of some steps of the same displacement.
+
+    Args:
+        pose: Poses before the first step [B, 7].
+        twist: Displacement of a step: translations [m] and rotation vectors [rad], [B, 6].
+        steps: Number of steps.
+    """
+    shift, turn = twist[:, :3], quaternion_exp(twist[:, 3:])
+    position, turned, poses = pose[:, :3], pose[:, 3:], []
+    for _ in range(steps):
+        position, turned = position + shift, quaternion_multiply(turn, turned)
+        poses.append(torch.cat([position, turned], dim=-1))
+    return poses

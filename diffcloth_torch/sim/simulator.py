@@ -40,7 +40,6 @@ from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.trajectory import Trajectory
 from diffcloth_torch.sim.rollout import Controls, StepParameters, roll_out
-from diffcloth_torch.sim.solve.cores import constants
 from diffcloth_torch.sim.solve.engine import Engine
 from diffcloth_torch.sim.solve.outcome import make_report
 from diffcloth_torch.sim.start import (
@@ -184,7 +183,7 @@ class Simulator(Observables):
             self._defaults |= choose_barrier(
                 self._engine, self._border, scene, contact, start, nonadjacent
             )
-        self._engine.constants = constants(self._layout, self._border.defaults)
+        self._engine.keep(self._border.defaults)
         if "barrier_distance" in self._defaults:
             distance = float(self._defaults["barrier_distance"])
             check_tolerance(solver.tolerance, distance, self.dt)

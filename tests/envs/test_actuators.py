@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.envs.actuators import Forces, Pickers, Twist, Velocities, moved
+from diffcloth_torch.envs.actuators import Forces, Pickers, Twist, Velocities, path_of
 
 F64 = torch.float64
 SHEET = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 0.1, 1, 0, 0, 0], name="sheet")  # 10 cm apart
@@ -103,7 +103,7 @@ def test_twists_turn_about_axes_of_the_world():
     about_x = [math.cos(quarter / 2), math.sin(quarter / 2), 0, 0]
     pose = torch.tensor([[1.0, 0, 0, *about_x]], dtype=F64)
     twist = torch.tensor([[0, 0.5, 0, 0, 0, quarter]], dtype=F64)
-    found = moved(pose, twist)[0]
+    found = path_of(pose, twist, 1)[0][0]
     torch.testing.assert_close(found[:3], torch.tensor([1.0, 0.5, 0], dtype=F64))
     # z of the body lay along -y of the world, and lies along x after a quarter turn about its z.
     w, x, y, z = found[3:].tolist()

@@ -34,10 +34,11 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
     Raises:
         InvalidInput: If a weight of such an attachment is not zero.
     """
-    whole = _are_whole(layout, targets)
+    if isinstance(targets, Tensor):
+        return
     for name in layout.assembly.springs.target_groups:
         springs = layout.assembly.springs.groups[name]
-        if not whole[springs].all() and numbers_of(weights)[:, springs].any():
+        if name not in (targets or ()) and numbers_of(weights)[:, springs].any():
             raise InvalidInput(
                 f"{label('control', 'attachments')} must set the target of {name!r}, whose "
                 "weight is not zero"

@@ -41,7 +41,8 @@ def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> 
 def without_axis(tensor: Tensor, batch: int | None) -> Tensor:
     """Copy rows [B or 1, ...] for a caller; without the leading axis if `batch` is None.
 
-    The copy shares no storage with inputs of the caller or with internal tensors.
+    The copy shares no storage with inputs of the caller or with internal tensors. A tensor without
+    numbers has no storage to share.
     """
     if batch is None:
         rows = tensor.select(0, 0)
@@ -49,7 +50,7 @@ def without_axis(tensor: Tensor, batch: int | None) -> Tensor:
         rows = tensor
     else:
         rows = tensor.expand(batch, *tensor.shape[1:])
-    return rows.clone(memory_format=torch.contiguous_format)
+    return rows.clone(memory_format=torch.contiguous_format) if rows.numel() else rows
 
 
 def without_axes(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from diffcloth_torch import _core, cpu
-from diffcloth_torch.autograd.core_function import as_array
+from diffcloth_torch.autograd.core_function import Constant, as_array
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.model.assembly import Assembly
@@ -20,7 +20,6 @@ from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
 from diffcloth_torch.model.springs import Springs
 from diffcloth_torch.sim.inputs.border import Given
 from diffcloth_torch.sim.inputs.layout import Layout
-from diffcloth_torch.sim.solve.step import Constant
 from diffcloth_torch.sim.solve.trees import tree_arguments
 
 __all__ = [

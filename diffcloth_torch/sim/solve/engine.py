@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.autograd.core_function import failing_as
+from diffcloth_torch.autograd.core_function import Constant, failing_as
 from diffcloth_torch.autograd.transforms import is_differentiated
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
@@ -27,6 +27,7 @@ from diffcloth_torch.sim.records.surfaces import Surfaces
 from diffcloth_torch.sim.solve.cores import (
     CoreOptions,
     arrays_of,
+    constants,
     core_inputs,
     make_core,
     with_deforming_bodies,
@@ -40,7 +41,7 @@ from diffcloth_torch.sim.solve.motion import (
     with_rows,
 )
 from diffcloth_torch.sim.solve.staggered import Staggered
-from diffcloth_torch.sim.solve.step import INTERSECTING, TURNED, Constant, Outcome, take_step
+from diffcloth_torch.sim.solve.step import INTERSECTING, TURNED, Outcome, take_step
 
 __all__ = ["Engine"]
 
@@ -121,6 +122,12 @@ class Engine:
                 coupling, layout, self.surfaces, self.dynamics, options, stiffness
             )
         self._scene_rest = torch.from_numpy(np.array(assembly.rest_positions))[None]
+
+    def keep(self, parameters: Fields) -> None:
+        """Prepare the parameters of the scene as constants: nobody may edit these tensors."""
+        self.constants = constants(self.layout, parameters)
+        if self.dynamics is not None:
+            self.dynamics.keep(parameters)
 
     @property
     def assembly(self) -> Assembly:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch import cpu
 from diffcloth_torch.errors import (
     InfeasibleMotion,
     IntersectingState,
@@ -69,12 +68,12 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
     numbers = _tensors(diagnostics) if batched else {n: diagnostics[n][0] for n in _REPORTED}
     return Report(
         **{name: numbers[name] for name in (*_INTEGERS, *_REALS)},
-        converged=cpu.tensor(converged, dtype=torch.bool) if batched else converged[0],
+        converged=torch.from_numpy(np.array(converged)) if batched else converged[0],
         seconds={phase: numbers[name] for phase, name in _SECONDS.items()},
         counts={what: numbers[name] for what, name in _COUNTS.items()},
         status=names if batched else names[0],
         criterion=criteria if batched else criteria[0],
-        certified=cpu.tensor(certified, dtype=torch.bool) if batched else certified[0],
+        certified=torch.from_numpy(np.array(certified)) if batched else certified[0],
         contacts=Contacts.of(
             diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
         ),

@@ -24,7 +24,6 @@ edited in place. Constants of a scene, which nobody can edit, are not saved.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,11 +34,14 @@ from torch import Tensor
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.autograd.core_function import (
+    NO_CONSTANTS,
     Arrays,
+    Constant,
     CoreFunction,
     as_array,
     evaluate,
     failing_as,
+    without_constants,
 )
 from diffcloth_torch.autograd.transforms import is_differentiated
 from diffcloth_torch.errors import SimulationError
@@ -53,7 +55,6 @@ __all__ = [
     "INTERSECTING",
     "TURNED",
     "UNCONVERGED",
-    "Constant",
     "Outcome",
     "diagnostics_of",
     "take_step",
@@ -80,7 +81,6 @@ _OUTPUTS = (
 )
 _TAPE = "tape_"
 _KEPT = "kept"
-_NO_CONSTANTS: Mapping[str, Constant] = MappingProxyType({})
 
 
 class Outcome(NamedTuple):
@@ -109,27 +109,10 @@ class Outcome(NamedTuple):
     coordinates: Tensor | None = None
 
 
-class Constant(NamedTuple):
-    """An input that cannot be edited from outside, and that needs no gradient.
-
-    Attributes:
-        tensor: The tensor that identifies it.
-        array: Its numbers.
-    """
-
-    tensor: Tensor
-    array: NDArray[np.float64]
-
-    @staticmethod
-    def of(tensor: Tensor) -> Constant:
-        """Make the constant of a tensor."""
-        return Constant(tensor, as_array(tensor))
-
-
 def take_step(
     core: _core.Simulator,
     inputs: dict[str, Tensor],
-    constants: Mapping[str, Constant] = _NO_CONSTANTS,
+    constants: Mapping[str, Constant] = NO_CONSTANTS,
 ) -> Outcome:
     """Compute one step; keep a tape only if a gradient may be requested.
 
@@ -139,8 +122,7 @@ def take_step(
         constants: Constants of the scene: an input that is one of these very tensors bypasses
             autograd.
     """
-    known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
-    given = {name: tensor for name, tensor in inputs.items() if name not in known}
+    known, given = without_constants(inputs, constants)
     # Checked here, because inside Function.forward gradients are always off.
     if not is_differentiated(given.values()):
         arrays = known | {name: as_array(t) for name, t in given.items()}
