@@ -51,13 +51,15 @@ def covered_area(positions: Tensor, spacing: float) -> Tensor:
 class SpreadCloth(SheetTask):
     """A sheet that lies in pleats is to be spread flat.
 
-    The start draws the pleats, and pickers begin up to 4 cm beside the edges along the pleats. With
-    the covered area A and the area Amax of the flat sheet, the reward is
-    graded(1 - A / Amax, .06, .5); after ClothFlatten of SoftGym and unfold of DaXBench.
+    The start draws the pleats, across x or across y of the sheet, and pickers begin up to 4 cm
+    beside the edges along the pleats. With the covered area A and the area Amax of the flat sheet,
+    the reward is graded(1 - A / Amax, .06, .5); after ClothFlatten of SoftGym and unfold of
+    DaXBench.
     """
 
     name = "SpreadCloth"
     steps = 45
+    directions: ClassVar[int] = 2  # of the pleats: across x alone, or also across y
     steepness: ClassVar[tuple[float, float]] = (1.2, 1.5)  # overhangs would bury the edges [rad]
     beside: ClassVar[float] = 0.04
     above: ClassVar[tuple[float, float]] = (0.02, 0.05)
@@ -68,15 +70,17 @@ class SpreadCloth(SheetTask):
         return SIDE / (self.side - 1)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also the steepness of the pleats, and their phase."""
+        """Also the steepness of the pleats, their phase, and their direction."""
         pleats = {
             "steepness": uniform(generator, 1, *self.steepness)[0],
             "phase": uniform(generator, 1, 0.0, 2 * math.pi)[0],
         }
+        if self.directions > 1:
+            pleats["across"] = cpu.randint(self.directions, (1,), generator=generator)[0]
         return super().draw(generator) | pleats
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
-        """Pleats across x with unchanged lengths: the slope is a sine of the arc length."""
+        """Pleats with unchanged lengths: the slope is a sine of the arc length."""
         n = self.side
         s = cpu.linspace(0.0, 1.0, 16 * (n - 1) + 1)
         middle = 0.5 * (s[1:] + s[:-1])
@@ -89,7 +93,13 @@ class SpreadCloth(SheetTask):
         x = x - 0.5 * x[:, -1:]
         z = z - z.amin(dim=-1, keepdim=True) + HEIGHT
         flat = self.flat(len(x))
-        return torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
+        across_x = torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
+        if "across" not in drawn:
+            return across_x
+        # Rows of vertices lie along x: the transposed sheet has its pleats across y.
+        across_y = across_x.reshape(-1, n, n, 3).transpose(1, 2).reshape(-1, n * n, 3)
+        across_y = across_y[..., [1, 0, 2]]
+        return torch.where(drawn["across"][:, None, None] == 1, across_y, across_x)
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """The settled sheet; also the area of the flat sheet, and its corners."""
@@ -123,12 +133,16 @@ class SpreadCloth(SheetTask):
 
     def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
         """The middles of the edges along the pleats."""
-        vertices = [self.vertex(self.side // 2, 0), self.vertex(self.side // 2, -1)]
-        return cpu.tensor(vertices, dtype=torch.int64).expand(len(drawn["turn"]), -1)
+        middle = self.side // 2
+        across_x = [self.vertex(middle, 0), self.vertex(middle, -1)]
+        across_y = [self.vertex(0, middle), self.vertex(-1, middle)]
+        return cpu.tensor([across_x, across_y], dtype=torch.int64)[drawn["across"]]
 
     def along(self, env: EnvState) -> Tensor:
         """The direction across the pleats, [B, 1, 3]."""
         turn = env.drawn["turn"]
+        if "across" in env.drawn:
+            turn = turn + 0.5 * math.pi * env.drawn["across"]
         return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=-1)[:, None]
 
     def scripted(self, env: EnvState) -> Tensor:
@@ -160,6 +174,7 @@ class FlingCloth(SpreadCloth):
 
     name = "FlingCloth"
     steps = 82
+    directions = 1
     steepness = (1.6, 1.9)
     _ALLOWED = 0.08
 
