@@ -532,6 +532,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "envs.Task.start": lambda w: call(
         w.env.task.start, [w.env.task.draw(torch.Generator("cpu").manual_seed(2))]
     ),
+    "envs.Task.goals": lambda w: call(w.env.task.goals, w.env_state),
     "envs.Task.succeeded": lambda w: call(w.env.task.succeeded, w.env_state),
     "envs.Task.success": lambda w: call(w.env.task.success, w.env_state),
     "envs.Task.terminal": lambda w: call(w.env.task.terminal, w.env_state),

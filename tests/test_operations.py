@@ -107,6 +107,7 @@ INNER = {
     "envs.Task.draw",
     "envs.Task.features",
     "envs.Task.frame_of",
+    "envs.Task.goals",
     "envs.Task.in_world",
     "envs.Task.initial",
     "envs.Task.observation",

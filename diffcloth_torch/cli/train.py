@@ -43,7 +43,7 @@ from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
 from diffcloth_torch.learn.trainer import Trainer, record_of, restore
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.viewers.look import Camera, Pictures
+from diffcloth_torch.viewers.look import Camera, Pictures, marker
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.show import show
 
@@ -52,6 +52,7 @@ __all__ = ["resume_training", "train"]
 # Files in a folder of results; TensorBoard reads the files of a folder.
 _RESULT, _POLICY, _EVENTS = "train.json", "policy.pt", "events"
 _VIDEO = "evaluation"
+_MARKER = 0.01  # radius of a point of the goal in pictures [m]
 _EVALUATION = {"updates": 0, "steps": 0, "return": 0.0, "success": 0.0, "seconds": 0.0}
 _BEST = {"updates": 0, "success": 0.0, "return": 0.0}
 _REPORT = {
@@ -442,14 +443,20 @@ class _Job:
         if not self.section.viewers:
             return
         seeds = self._starts["report"][: self.section.episodes]
-        _, _, states = follow(self._make_env(num_envs=len(seeds)), self._policy(), seeds)
+        env = self._make_env(num_envs=len(seeds))
+        env.reset(seed=seeds)
+        points = env.task.goals(env.env_state)
+        of_first = [] if points is None else [marker(p, _MARKER) for p in points[0].numpy()]
+        _, _, states = follow(env, self._policy(), seeds)
         task, options = self.trainer.task, self.section.pictures.model_dump()
         scene: Scene = task.simulator.scene
         camera = Camera(**options["camera"])
         if "record" in self.section.viewers:
             pictures = Pictures(**{**options, "camera": camera})
             fps = 1 / (task.simulator.dt * task.substeps)
-            with Record(out, scene, fps=fps, pictures=pictures, name=_VIDEO) as record:
+            with Record(
+                out, scene, fps=fps, pictures=pictures, goals=of_first, name=_VIDEO
+            ) as record:
                 for state in states:
                     record.show(state[0])
         if "web" in self.section.viewers:

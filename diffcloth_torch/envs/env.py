@@ -182,6 +182,10 @@ class Task(ABC):
         """The frame of the task at a start; None for the world frame."""
         return None
 
+    def goals(self, env: EnvState) -> Tensor | None:
+        """Points [B, g, 3] that pictures of the task mark; None without such points."""
+        return env.drawn.get("goal")
+
     def terminal(self, env: EnvState) -> Tensor:
         """Return whether an episode ends before its horizon [B]: if the simulation failed."""
         return env.failed

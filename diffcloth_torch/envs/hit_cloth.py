@@ -95,6 +95,10 @@ class HitCloth(BuiltTask):
             "time": self.observed(env.elapsed),
         }
 
+    def goals(self, env: EnvState) -> Tensor:
+        """The vertices of the target."""
+        return env.drawn["target"]
+
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target [m], [B]."""
         return lengths(env.state.positions - env.drawn["target"]).mean(dim=-1)

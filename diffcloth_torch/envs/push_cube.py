@@ -116,6 +116,11 @@ class PushCube(BuiltTask):
         """Return whether the cube is within 3 cm of the target."""
         return self.distance(env) < _CLOSE
 
+    def goals(self, env: EnvState) -> Tensor:
+        """The target of the center of the cube, at its present height."""
+        height = env.state.body_poses[:, 0, 2:3]
+        return torch.cat([env.drawn["target"], height], dim=1)[:, None]
+
     def distance(self, env: EnvState) -> Tensor:
         """Distance of the cube from the target [m], [B]."""
         return lengths(self._away(env))

@@ -79,6 +79,10 @@ class TwoCloths(BuiltTask):
             "time": self.observed(env.elapsed),
         }
 
+    def goals(self, env: EnvState) -> Tensor:
+        """The target of the center."""
+        return env.drawn["target"][:, None]
+
     def distance(self, env: EnvState) -> Tensor:
         """Distance of the center from the target [m], [B]."""
         return lengths(self._away(env))
