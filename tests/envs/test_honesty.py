@@ -194,7 +194,8 @@ def test_the_goal_is_observed(name):
             assert changed & {"goal", "to_goal", "to_target"}
         assert "start" in one or name in ("PushCube", "TwoCloths", "HitCloth")
     ends = [env.task.goals(env.task.start([dict(d)])) for d in (drawn, other)]
-    assert ends[0].shape[0] == 1 and ends[0].shape[2] == 3
+    assert ends[0].shape[0] == 1
+    assert ends[0].shape[2] == 3
     assert (ends[1] - ends[0]).abs().max() > 0.01
 
 
