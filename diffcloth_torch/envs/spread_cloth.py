@@ -24,6 +24,7 @@ _CELL = 0.02  # cell size of the grid for areas [m]
 _EXTENT = 0.6  # extent of the grid from the origin in each direction [m]
 _WIDTH = 0.6  # kernel width around a vertex, over the distance of vertices or cells, if larger
 _FILL = 0.54  # chosen such that cells within a flat sheet count .97
+_CLOSED = 9  # transitions of the script of FlingCloth until its pickers are closed
 _BARE = 0.06  # largest missing share of the area of a flat sheet for success
 
 
@@ -211,7 +212,10 @@ class FlingCloth(SpreadCloth):
         laid = [foot + k / 6 * along + (1.02 - k / 6) * up for k in range(7)]
         # Friction with the table pulls out an edge that is turned under.
         end = laid[-1] + 0.3 * along
-        points = [here, here, *[foot + 1.15 * up] * 2, *laid, end, end, end + 0.1 * up]
-        times = [4, 6, 24, 30, *(33 + 4 * k for k in range(7)), 63, 65, 68]
+        # The pleats give way: pickers follow the corners until they hold them.
+        corners = at(env.state.positions, env.drawn["picked"])
+        corners = torch.where((env.elapsed < _CLOSED)[:, None, None], corners, here)
+        points = [corners, corners, *[foot + 1.15 * up] * 2, *laid, end, end, end + 0.1 * up]
+        times = [7, _CLOSED, 24, 30, *(33 + 4 * k for k in range(7)), 63, 65, 68]
         grasps = [-1.0, *[1.0] * (len(times) - 2), -1.0]
         return self.moves_to(env, *follow(env, times, points, grasps))
