@@ -11,7 +11,8 @@
 with it and this checkout side by side, as by `benchmarks.compare`. Then this checkout alone is
 timed by phases, as by `benchmarks.step`, and with several losses in one backward. `--newton` is the
 Python of an environment with Newton, which is timed beside this package as by `benchmarks.peers`.
-Measurements are stored in docs/performance.json, from which page and plots are made.
+Measurements are stored in docs/performance.json, from which page and plots are made; peers,
+environments and integrators that a run does not measure keep their records.
 `--forward-peers` repeats the measurements of `benchmarks.forward_peers`, with the Pythons of its
 two environments, `--environments` those by `benchmarks.scripted`, and `--integrators` the part
 `explicit` of `benchmarks.integrators`; all keep all other records.
@@ -125,9 +126,11 @@ def main(
         earlier = json.loads(file.read_text()) if file.exists() else {}
         file.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as kept:
-            measured = measure(_folders(others), newton, cpu, quick, Path(kept))
-        for part in ("forward_peers", "environments", "integrators"):
-            measured[part] = earlier.get(part)
+            measured = measure(_folders(others), cpu, quick, Path(kept))
+        if newton is not None:
+            measured["peers"] = measure_peers(newton, quick)
+        for part in ("peers", "forward_peers", "environments", "integrators"):
+            measured.setdefault(part, earlier.get(part))
         file.write_text(json.dumps(measured, indent=1) + "\n")
     records = json.loads(file.read_text())
     (docs / "images").mkdir(exist_ok=True)
@@ -149,9 +152,7 @@ def _folders(others: Iterable[str]) -> dict[str, Path]:
 # ---- measuring ----
 
 
-def measure(
-    others: dict[str, Path], newton: Path | None, cpu: bool, quick: bool, kept: Path
-) -> Records:
+def measure(others: dict[str, Path], cpu: bool, quick: bool, kept: Path) -> Records:
     """All measurements of the page, as plain numbers.
 
     The folder `kept` stores each scene's regime, because the approach takes longer than the timing.
@@ -201,10 +202,19 @@ def measure(
     ]
     shared = [(BATCH_SCENES[0], sizes[0])] if quick else SHARED
     records["shared"] = [_time_shared(name, size, kept) for name, size in shared]
-    records["peers"] = list(time_all(newton, phase_sizes[0])) if newton else []
     records["load"].append(round(os.getloadavg()[0], 1))
     records["minutes"] = round((time.perf_counter() - start) / 60, 1)
     return records
+
+
+def measure_peers(newton: Path, quick: bool) -> Records:
+    """Return the times that `benchmarks.peers` measures, with date and processor."""
+    torch.set_num_threads(1)
+    return {
+        "date": date.today().isoformat(),
+        "processor": _processor(),
+        "rows": list(time_all(newton, 6 if quick else PHASE_SIZES[0])),
+    }
 
 
 def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
@@ -428,8 +438,10 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     parts += ["## Many losses", _LOSS_TEXT, losses]
     shared = _pair_table(records["shared"], ["scene", "size"], {"one": "one thread", "two": "two"})
     parts += ["## One environment on two threads", _SHARED_TEXT, shared]
-    if records["peers"]:
-        parts += ["## Compared with Newton", _PEER_TEXT, _peer_table(records["peers"])]
+    if records.get("peers"):
+        found = records["peers"]
+        parts += ["## Compared with Newton", _PEER_TEXT.format(**found)]
+        parts += [_peer_table(found["rows"])]
     if records.get("forward_peers"):
         parts += ["## Compared with VBD and MuJoCo", _forward_peer_text(records["forward_peers"])]
         parts += [_forward_peer_table(records["forward_peers"]["rows"])]
@@ -599,13 +611,14 @@ def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) ->
 
 
 _PEER_TEXT = """\
-The differentiable cloth of Newton (`pip install newton`) on the same processor uses explicit
-substeps in single precision, with penalties where a vertex meets a body. Both simulate 15 frames at
-60 Hz from the same start; `python -m benchmarks.peers` describes how. Times are processor times of
-a frame. `gradient` is the error of each gradient against differences of its own loss; where
-vertices bounce, differences of Newton's loss depend on their step. Those of ours are the gradient
-as long as they do not cross to another minimum of a step ([Branches](notes/branches.md)), which on
-the sphere may be as near as 1e-7 m/s. `depth` is the largest depth of the sheet inside the body."""
+The differentiable cloth of Newton (`pip install newton`) uses explicit substeps in single
+precision, with penalties where a vertex meets a body. Both simulate 15 frames at 60 Hz from the
+same start; `python -m benchmarks.peers` describes how. Measured on {date} ({processor}). Times are
+processor times of a frame. `gradient` is the error of each gradient against differences of its own
+loss; where vertices bounce, differences of Newton's loss depend on their step. Those of ours are
+the gradient as long as they do not cross to another minimum of a step
+([Branches](notes/branches.md)), which on the sphere may be as near as 1e-7 m/s. `depth` is the
+largest depth of the sheet inside the body."""
 
 
 def _peer_table(rows: list[Records]) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,6 +20,10 @@ from diffcloth_torch.sim.records.contacts import Contacts
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 
 __all__ = ["Report", "combine_reports", "outcome_text"]
+
+
+def _nothing() -> None:
+    return None
 
 
 @saved
@@ -81,11 +85,12 @@ class Report:
     motion_fraction: float | Tensor
     seconds: dict[str, float | Tensor]
     counts: dict[str, int | Tensor] = field(default_factory=dict)
-    status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
+    # Factories, not defaults: the class has no attribute that hides a field not made yet.
+    status: str | tuple[str, ...] = field(default_factory=tuple)  # default: from `converged`
     contacts: Contacts = field(default_factory=Contacts)
-    cpu_seconds: float | Tensor | None = None  # if left out, unknown
-    criterion: str | tuple[str, ...] = ()  # if left out, unknown
-    certified: bool | Tensor | None = None  # if left out, equal to `converged`
+    cpu_seconds: float | Tensor | None = field(default_factory=_nothing)  # default: unknown
+    criterion: str | tuple[str, ...] = field(default_factory=tuple)  # default: unknown
+    certified: bool | Tensor | None = field(default_factory=_nothing)  # default: `converged`
 
     def __post_init__(self) -> None:
         if self.cpu_seconds is None:
@@ -112,6 +117,37 @@ class Report:
                 raise TypeError(
                     f"Report: `{entry}` must be a str or a tuple of them, got {names!r}"
                 )
+
+    @staticmethod
+    def later(status: str | tuple[str, ...], make: Callable[[], Report]) -> Report:
+        """Return a report that is made when another field than its status is first read.
+
+        Args:
+            status: Its status.
+            make: Makes the report; called at most once by a thread.
+        """
+        report = object.__new__(Report)
+        report.__dict__.update(status=status, _make=make)
+        return report
+
+    if not TYPE_CHECKING:  # a type checker knows the fields
+
+        def __getattr__(self, name: str) -> Any:
+            self._complete()
+            if name in self.__dict__:
+                return self.__dict__[name]
+            raise AttributeError(f"'Report' object has no attribute {name!r}")
+
+    def _complete(self) -> None:
+        own = self.__dict__
+        make = own.get("_make")
+        if make is not None:
+            own.update(vars(make()))
+            own.pop("_make", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._complete()
+        return dict(vars(self))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Checks the fields, and completes a report of version 0.1, which lacks the last three.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from diffcloth_torch.sim.solve.step import (
     UNCONVERGED,
 )
 
-__all__ = ["make_report", "raise_on_failure"]
+__all__ = ["later_report", "make_report", "raise_on_failure"]
 
 
 def _named(prefix: str) -> dict[str, str]:
@@ -55,6 +56,13 @@ _ROWS: dict[type, tuple[str, ...]] = {
     np.float64: (*_REALS, *_SECONDS.values()),
 }
 _REPORTED = tuple(name for names in _ROWS.values() for name in names)
+
+
+def later_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
+    """Return the report of `make_report`, made when it is read: most steps of a loop are not."""
+    names = tuple([_NAMES[status] for status in diagnostics["status"]])
+    make = partial(make_report, diagnostics, surfaces, batched=batched)
+    return Report.later(names if batched else names[0], make)
 
 
 def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
