@@ -2,7 +2,7 @@
 
     python -m benchmarks.learning                     # all tasks, methods and seeds
     python -m benchmarks.learning FoldCloth --method imitate --seed 0
-    python -m benchmarks.learning --only-show
+    python -m benchmarks.learning --only-show --page docs/learning.md
 
 Each task, size, method, seed and budget is a line of JSON in the file of results; existing lines
 are not repeated, so an interrupted run continues. Rows that inform most come first: methods that
@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,6 +33,7 @@ import torch
 
 from benchmarks.environments import roll_out
 from benchmarks.learning_methods import FROM_REWARDS, METHODS, UNLEARNED, Job, learned
+from benchmarks.learning_tables import listing, with_tables
 from diffcloth_torch import envs
 from diffcloth_torch.learn import Plans
 from diffcloth_torch.learn.evaluation import wilson
@@ -67,6 +67,11 @@ _FRESH = 10_000  # seed of the starts of evaluations
     show_default=True,
     type=click.Path(dir_okay=False, path_type=Path),
 )
+@click.option(
+    "--page",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Where to write tables, such as docs/learning.md.",
+)
 @click.option("--only-show", is_flag=True, help="Run nothing: show what the file has.")
 def main(
     tasks: Sequence[str],
@@ -79,6 +84,7 @@ def main(
     steps: int | None,
     others: Sequence[int],
     results: Path,
+    page: Path | None,
     only_show: bool,
 ) -> None:
     torch.set_num_threads(1)
@@ -96,7 +102,9 @@ def main(
         with results.open("a") as file:
             file.write(json.dumps(row) + "\n")
         rows.append(row)
-    show(rows)
+    print(listing(rows))
+    if page is not None:
+        page.write_text(with_tables(page.read_text(), rows))
 
 
 def jobs(
@@ -154,21 +162,6 @@ def read(path: Path) -> list[dict[str, Any]]:
     if whole != text:
         path.write_text(whole)
     return [json.loads(line) for line in whole.splitlines()]
-
-
-def show(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows as a table."""
-    print("| task | size | method | seed | success | return | steps | minutes | revision |")
-    print("|---" * 9 + "|")
-    for row in sorted(rows, key=lambda r: (r["task"], METHODS.index(r["method"]), r["seed"])):
-        low, high = row["interval"]
-        share = f"{row['success']:.0%} ({low:.0%} to {high:.0%})".replace("%", " %")
-        print(
-            f"| `{row['task']}` | {row['size']} | {row['method']} | {row['seed']} | "
-            f"{share} of {row['episodes']} | {row['return']:.1f} | {row['steps']} | "
-            f"{row['minutes']:.1f} | {row['revision']} |"
-        )
-    sys.stdout.flush()
 
 
 def measured(job: Job, episodes: int) -> dict[str, Any]:

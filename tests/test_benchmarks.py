@@ -563,6 +563,30 @@ def test_rows_of_learning_are_made_once(tmp_path):
     assert second[1]["return"] > first[0]["return"]
 
 
+def test_tables_of_learning_pool_seeds():
+    tables = importlib.import_module("benchmarks.learning_tables")
+
+    def row(method, seed, success, size=7, budget=0):
+        return {
+            "task": "HitCloth", "size": size, "method": method, "seed": seed, "budget": budget,
+            "episodes": 4, "success": success, "return": 1.0 + seed, "steps": 10, "minutes": 0.5,
+        }  # fmt: skip
+
+    rows = [row("imitate", 0, 1.0), row("imitate", 1, 0.5), row("transfer", 0, 0.25, size=9)]
+    rows += [row("ppo", 0, 0.0, budget=20), row("ppo", 0, 0.5, budget=30)]
+    text = tables.with_tables("a\n<!-- methods -->\nold\n<!-- end of methods -->\nb\n", rows)
+    assert text.splitlines()[:2] == ["a", "<!-- methods -->"]
+    assert text.splitlines()[-2:] == ["<!-- end of methods -->", "b"]
+    assert "old" not in text
+    cells = "|  |  |  | 75 % (41 % to 93 %) | 1.5 | 10 | 0.5 | 25 % (5 % to 70 %) |"
+    assert "| `HitCloth` " + cells in text
+    assert "| `HitCloth` | PPO | 1 | 0 % (0 % to 49 %) | 1.0 | 10 | 0.5 |" in text
+    assert "| `HitCloth` | PPO | 1 | 50 % (15 % to 85 %) | 1.0 | 10 | 0.5 |" in text
+    assert tables.with_tables(text, rows) == text
+    with pytest.raises(ValueError, match="the page must have lines"):
+        tables.with_tables("a", rows)
+
+
 def test_jobs_that_inform_most_come_first(tmp_path):
     learning = importlib.import_module("benchmarks.learning")
     tasks, others = ("DropCloth", "HitCloth"), (9, 12)
@@ -615,7 +639,7 @@ def test_learning_counts_its_steps(tmp_path):
     moved = row("transfer", size=5)
     assert moved["steps"] == 0
     assert row("transfer")["return"] == imitated["return"]  # the same policy
-    assert row("plan", episodes=1)["episodes"] == 1
+    assert row("plan", episodes=1, attempts=1, knots=2, iterations=1)["episodes"] == 1
     assert row("apg", budget=150)["steps"] == 2 * 4 * 36
     assert row("shac", budget=150)["steps"] == 3 * 4 * 18
     assert row("ppo", budget=150)["steps"] == 4 * 64
