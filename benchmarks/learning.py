@@ -1,26 +1,30 @@
 """Success of each method on each task, at starts that it was not trained on.
 
+    python -m benchmarks.learning                     # all tasks, methods and seeds
     python -m benchmarks.learning FoldCloth --method imitate --seed 0
-    python -m benchmarks.learning                     # all tasks and methods, seeds 0, 1 and 2
-    python -m benchmarks.learning --only-show
+    python -m benchmarks.learning --only-show --page docs/learning.md
 
-Each task, method and seed is a line of JSON in the file of results; existing lines are not
-repeated. `return` and `success` are means over the episodes, `interval` is the Wilson interval of
-the success at 95 %, `steps` the environment steps of learning, `minutes` its processor time.
+Each task, size, method, seed and budget is a line of JSON in the file of results; existing lines
+are not repeated, so an interrupted run continues. Rows that inform most come first: methods that
+learn nothing, imitation, then five methods that learn from rewards, all with the first seed; then
+other sizes and other seeds; plans at the end.
 
-`zero`, `random` and `script` learn nothing; `replay` repeats the actions of one scripted episode.
-`imitate` is `dc.learn.imitate` of the script. `plan` is `dc.learn.plan`: its success refers to the
-starts for which it plans, because it returns no policy.
+`return` and `success` are means over the episodes, `interval` is the Wilson interval of the success
+at 95 %, `steps` the environment steps of learning, `minutes` its processor time. The success of
+`plan` refers to the starts for which it plans, because it returns no policy.
+
+The methods are described in `benchmarks/learning_methods.py`. Methods that learn from rewards have
+30,000 environment steps on FoldCloth, LiftCloth, PushCube and HitCloth, and on the other tasks
+10,000 and only the first seed.
 """
 
 from __future__ import annotations
 
 import json
-import sys
+import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +32,15 @@ import click
 import torch
 
 from benchmarks.environments import roll_out
+from benchmarks.learning_methods import FROM_REWARDS, METHODS, UNLEARNED, Job, learned
+from benchmarks.learning_tables import listing, with_tables
 from diffcloth_torch import envs
-from diffcloth_torch.learn import imitate, plan
+from diffcloth_torch.learn import Plans
 from diffcloth_torch.learn.evaluation import wilson
 
-METHODS = ("zero", "random", "script", "replay", "imitate", "plan")
-SOFT = {"opens_at": -1.0, "reach": 0.06}  # grasps with gradients
-SHEETS = ("FoldCloth", "FoldClothDiagonal", "SpreadCloth", "DropCloth", "FlingCloth")
+LONG = ("FoldCloth", "LiftCloth", "PushCube", "HitCloth")  # tasks with the larger budget
+BUDGETS = 30_000, 10_000
 _FRESH = 10_000  # seed of the starts of evaluations
-_REPLAYED = 20_000  # and of the episode that is replayed
-
-Result = tuple[torch.Tensor, torch.Tensor, int, float]
-"""Returns [n], successes [n], environment steps and seconds of learning."""
 
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
@@ -50,11 +51,26 @@ Result = tuple[torch.Tensor, torch.Tensor, int, float]
 @click.option("--episodes", default=64, show_default=True, type=click.IntRange(1))
 @click.option("--rounds", type=click.IntRange(1), help="Of `imitate`.")
 @click.option("--starts", type=click.IntRange(1), help="Episodes of a round, or plans.")
+@click.option("--steps", type=click.IntRange(1), help="Of methods that learn from rewards.")
+@click.option(
+    "--transfer",
+    "others",
+    multiple=True,
+    default=(9, 12),
+    show_default=True,
+    type=click.IntRange(4),
+    help="Sizes at which the policy of `imitate` is evaluated, too.",
+)
 @click.option(
     "--results",
     default="results/learning.jsonl",
     show_default=True,
     type=click.Path(dir_okay=False, path_type=Path),
+)
+@click.option(
+    "--page",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Where to write tables, such as docs/learning.md.",
 )
 @click.option("--only-show", is_flag=True, help="Run nothing: show what the file has.")
 def main(
@@ -65,30 +81,76 @@ def main(
     episodes: int,
     rounds: int | None,
     starts: int | None,
+    steps: int | None,
+    others: Sequence[int],
     results: Path,
+    page: Path | None,
     only_show: bool,
 ) -> None:
     torch.set_num_threads(1)
-    rows = read(results)
-    have = {key_of(row) for row in rows}
     given = {"rounds": rounds, "episodes": starts}
     changed = {name: value for name, value in given.items() if value is not None}
-    for task in tasks or tuple(envs.TASKS):
-        for method in methods:
-            for seed in seeds:
-                if only_show or (task, size, method, seed) in have:
+    rows = read(results)
+    have = {key_of(row) for row in rows}
+    policies = results.with_suffix("")
+    work = jobs(tasks or tuple(envs.TASKS), methods, seeds, size, others, steps, changed, policies)
+    for job in work:
+        if only_show or job.key in have:
+            continue
+        row = measured(job, episodes)
+        results.parent.mkdir(parents=True, exist_ok=True)
+        with results.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        rows.append(row)
+    print(listing(rows))
+    if page is not None:
+        page.write_text(with_tables(page.read_text(), rows))
+
+
+def jobs(
+    tasks: Sequence[str],
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    size: int,
+    others: Sequence[int],
+    steps: int | None,
+    changed: Mapping[str, int],
+    policies: Path,
+) -> list[Job]:
+    """All jobs, those that inform most first."""
+    found = []
+    for seed in seeds:
+        for task in tasks:
+            for method in methods:
+                budget = 0
+                if method in FROM_REWARDS:
+                    budget = steps or BUDGETS[task not in LONG]
+                    if task not in LONG and seed != seeds[0]:
+                        continue
+                if method == "transfer" and seed != seeds[0]:
                     continue
-                row = measured(task, size, method, seed, episodes, changed)
-                results.parent.mkdir(parents=True, exist_ok=True)
-                with results.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-                rows.append(row)
-    show(rows)
+                found += [
+                    Job(task, each, method, seed, budget, size, changed, policies)
+                    for each in (others if method == "transfer" else [size])
+                ]
+    return sorted(found, key=lambda job: (_phase(job, seeds[0]), methods.index(job.method)))
 
 
-def key_of(row: dict[str, Any]) -> tuple[str, int, str, int]:
-    """Return task, size, method and seed, which identify a row."""
-    return row["task"], row["size"], row["method"], row["seed"]
+def _phase(job: Job, first_seed: int) -> int:
+    """Number of the part of the benchmark to which a job belongs."""
+    if job.method == "plan":
+        return 9
+    if job.method in FROM_REWARDS and job.task not in LONG:
+        return 8
+    if job.method == "transfer":
+        return 3
+    phase = 0 if job.method in UNLEARNED else 1 if job.method == "imitate" else 2
+    return phase if job.seed == first_seed else phase + 4
+
+
+def key_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return task, size, method, seed and budget, which identify a row."""
+    return tuple(row[name] for name in ("task", "size", "method", "seed", "budget"))
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -102,81 +164,38 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole.splitlines()]
 
 
-def show(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows as a table."""
-    print("| task | size | method | seed | return | success | steps | minutes |")
-    print("|---" * 8 + "|")
-    for row in sorted(rows, key=lambda r: (r["task"], METHODS.index(r["method"]), r["seed"])):
-        low, high = row["interval"]
-        share = f"{row['success']:.0%} ({low:.0%} to {high:.0%})".replace("%", " %")
-        print(
-            f"| `{row['task']}` | {row['size']} | {row['method']} | {row['seed']} | "
-            f"{row['return']:.1f} | {share} of {row['episodes']} | {row['steps']} | "
-            f"{row['minutes']:.1f} |"
-        )
-    sys.stdout.flush()
-
-
-def measured(
-    task: str, size: int, method: str, seed: int, episodes: int, changed: dict[str, int]
-) -> dict[str, Any]:
-    """The row of a task, a method and a seed."""
-    make = partial(envs.make, task, size=size)
-    run = {"imitate": _imitate, "plan": _plan}.get(method, partial(_unlearned, method))
-    returns, success, steps, seconds = run(make, seed, episodes, changed)
+def measured(job: Job, episodes: int) -> dict[str, Any]:
+    """The row of a job."""
+    with _counted() as spent:
+        found = learned(job)
+    if isinstance(found, Plans):
+        returns, success = found.returns, found.success
+    else:
+        env = job.make(num_envs=episodes, autoreset_mode="Disabled")
+        with torch.no_grad():
+            returns, success, _ = roll_out(env, found(env), _FRESH + job.seed)
+    steps, seconds = spent
     count, done = len(success), int(success.sum())
     return {
-        "task": task,
-        "size": size,
-        "method": method,
-        "seed": seed,
+        **dict(zip(("task", "size", "method", "seed", "budget"), job.key, strict=True)),
         "episodes": count,
         "return": round(float(returns.mean()), 4),
         "success": done / count,
         "interval": [round(bound, 4) for bound in wilson(done, count)],
         "steps": steps,
         "minutes": round(seconds / 60, 3),
-        "given": changed,
+        "options": job.options,
+        "given": dict(job.changed),
+        "revision": _revision(),
     }
 
 
-def _imitate(make: Callable[..., Any], seed: int, episodes: int, changed: dict[str, int]) -> Result:
-    with _counted() as learned:
-        policy = imitate(make, "scripted", seed=seed, **changed)
-    env = make(num_envs=episodes, autoreset_mode="Disabled")
-    with torch.no_grad():
-        returns, success, _ = roll_out(
-            env, lambda _: policy(env.initialize_trajectory()), _FRESH + seed
-        )
-    return returns, success, *learned
-
-
-def _plan(make: Callable[..., Any], seed: int, _: int, changed: dict[str, int]) -> Result:
-    soft = SOFT if make(num_envs=1).task.name in SHEETS else {}
-    given = {name: value for name, value in changed.items() if name != "rounds"}
-    with _counted() as learned:
-        plans = plan(partial(make, **soft), seed=seed, **given)
-    return plans.returns, plans.success, *learned
-
-
-def _unlearned(
-    method: str, make: Callable[..., Any], seed: int, episodes: int, _: dict[str, int]
-) -> Result:
-    env = make(num_envs=episodes, autoreset_mode="Disabled")
-    shape = episodes, env.task.action_size
-    noise = torch.Generator().manual_seed(seed)
-    script: list[torch.Tensor] = []
-    if method == "replay":
-        one = make(num_envs=1, autoreset_mode="Disabled")
-        script = roll_out(one, lambda _: one.scripted_actions(), _REPLAYED + seed)[2]
-    act: dict[str, Callable[[int], torch.Tensor]] = {
-        "zero": lambda _: torch.zeros(shape),
-        "random": lambda _: 2 * torch.rand(shape, generator=noise) - 1,
-        "script": lambda _: env.scripted_actions(),
-        "replay": lambda k: script[k].expand(shape),
-    }
-    returns, success, _made = roll_out(env, act[method], _FRESH + seed)
-    return returns, success, 0, 0.0
+def _revision() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    here = Path(__file__).parent
+    return subprocess.run(
+        command, cwd=here, capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 @contextmanager

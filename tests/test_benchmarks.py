@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import itertools
 import json
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from click.testing import CliRunner
 
 import diffcloth_torch as dc
@@ -561,11 +563,83 @@ def test_rows_of_learning_are_made_once(tmp_path):
     assert second[1]["return"] > first[0]["return"]
 
 
+def test_tables_of_learning_pool_seeds():
+    tables = importlib.import_module("benchmarks.learning_tables")
+
+    def row(method, seed, success, size=7, budget=0):
+        return {
+            "task": "HitCloth", "size": size, "method": method, "seed": seed, "budget": budget,
+            "episodes": 4, "success": success, "return": 1.0 + seed, "steps": 10, "minutes": 0.5,
+        }  # fmt: skip
+
+    rows = [row("imitate", 0, 1.0), row("imitate", 1, 0.5), row("transfer", 0, 0.25, size=9)]
+    rows += [row("ppo", 0, 0.0, budget=20), row("ppo", 0, 0.5, budget=30)]
+    text = tables.with_tables("a\n<!-- methods -->\nold\n<!-- end of methods -->\nb\n", rows)
+    assert text.splitlines()[:2] == ["a", "<!-- methods -->"]
+    assert text.splitlines()[-2:] == ["<!-- end of methods -->", "b"]
+    assert "old" not in text
+    cells = "|  |  |  | 75 % (41 % to 93 %) | 1.5 | 10 | 0.5 | 25 % (5 % to 70 %) |"
+    assert "| `HitCloth` " + cells in text
+    assert "| `HitCloth` | PPO | 1 | 0 % (0 % to 49 %) | 1.0 | 10 | 0.5 |" in text
+    assert "| `HitCloth` | PPO | 1 | 50 % (15 % to 85 %) | 1.0 | 10 | 0.5 |" in text
+    assert tables.with_tables(text, rows) == text
+    with pytest.raises(ValueError, match="the page must have lines"):
+        tables.with_tables("a", rows)
+
+
+def test_jobs_that_inform_most_come_first(tmp_path):
+    learning = importlib.import_module("benchmarks.learning")
+    tasks, others = ("DropCloth", "HitCloth"), (9, 12)
+    jobs = learning.jobs(tasks, learning.METHODS, (0, 1), 7, others, None, {}, tmp_path)
+    assert len({job.key for job in jobs}) == len(jobs)
+    order = [(job.task, job.size, job.method, job.seed) for job in jobs]
+    assert order[:2] == [("DropCloth", 7, "zero", 0), ("HitCloth", 7, "zero", 0)]
+    milestones = [
+        ("HitCloth", 7, "replay", 0),
+        ("DropCloth", 7, "imitate", 0),
+        ("HitCloth", 7, "ppo", 0),
+        ("HitCloth", 12, "transfer", 0),
+        ("DropCloth", 7, "script", 1),
+        ("HitCloth", 7, "sapo", 1),
+        ("DropCloth", 7, "apg", 0),
+        ("HitCloth", 7, "plan", 1),
+    ]
+    assert [order.index(each) for each in milestones] == sorted(map(order.index, milestones))
+    budgets = {(job.task, job.seed): job.budget for job in jobs if job.method == "sac"}
+    assert budgets == {("HitCloth", 0): 30_000, ("HitCloth", 1): 30_000, ("DropCloth", 0): 10_000}
+
+
+def test_learning_uses_the_settings_of_the_configurations(tmp_path):
+    methods = importlib.import_module("benchmarks.learning_methods")
+    assert methods.stage_of("FoldCloth") == {"rounds": 6, "episodes": 48, "iterations": 1000}
+    for task in methods.envs.TASKS:
+        assert methods.stage_of(task)["rounds"] >= 1
+    job = methods.Job("FoldCloth", 4, "apg", 5, 100, 4, {}, tmp_path)
+    options, num_envs = methods.trainer_of(job)
+    document = yaml.safe_load((ROOT / "configs/train_fold_gradients.yaml").read_text())
+    assert options.plan_knots == document["trainer"]["plan_knots"]
+    assert options.seed == 5
+    assert num_envs == document["num_envs"]
+    options, _ = methods.trainer_of(dataclasses.replace(job, method="sapo"))
+    assert options.algorithm == "sapo"
+    assert options.horizon == 22  # half of an episode
+
+
 @pytest.mark.slow
 def test_learning_counts_its_steps(tmp_path):
     learning = importlib.import_module("benchmarks.learning")
-    row = learning.measured("HitCloth", 4, "imitate", 0, 2, {"rounds": 2, "episodes": 2})
-    assert row["steps"] == 2 * 2 * 36
-    assert row["minutes"] > 0
-    row = learning.measured("HitCloth", 4, "plan", 0, 2, {"episodes": 1})
-    assert row["episodes"] == 1
+
+    def row(method, size=4, budget=0, **changed):
+        job = learning.Job("HitCloth", size, method, 0, budget, 4, changed, tmp_path)
+        return learning.measured(job, 2)
+
+    imitated = row("imitate", rounds=2, episodes=2, iterations=20)
+    assert imitated["steps"] == 2 * 2 * 36
+    assert imitated["minutes"] > 0
+    moved = row("transfer", size=5)
+    assert moved["steps"] == 0
+    assert row("transfer")["return"] == imitated["return"]  # the same policy
+    assert row("plan", episodes=1, attempts=1, knots=2, iterations=1)["episodes"] == 1
+    assert row("apg", budget=150)["steps"] == 2 * 4 * 36
+    assert row("shac", budget=150)["steps"] == 3 * 4 * 18
+    assert row("ppo", budget=150)["steps"] == 4 * 64

@@ -1,0 +1,125 @@
+"""Tables of the benchmark of learning: rows of several seeds pooled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+from benchmarks.learning_methods import FROM_REWARDS, METHODS
+from diffcloth_torch.learn.evaluation import wilson
+
+MARKS = "<!-- methods -->\n", "<!-- end of methods -->\n"  # around the tables on a page
+Rows = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Rows of a task, a size, a method and a budget, with all their seeds.
+
+    Attributes:
+        share: Successes of all episodes, with the Wilson interval.
+        seeds: Number of seeds.
+        mean: Mean of the returns.
+        steps: Mean of the environment steps of learning.
+        minutes: Mean processor time of learning [min].
+    """
+
+    share: str
+    seeds: int
+    mean: str
+    steps: str
+    minutes: str
+
+
+def pooled(rows: Rows) -> Pooled:
+    """Pool rows that differ in their seeds."""
+    count = sum(row["episodes"] for row in rows)
+    done = sum(round(row["success"] * row["episodes"]) for row in rows)
+    low, high = wilson(done, count)
+    return Pooled(
+        f"{done / count:.0%} ({low:.0%} to {high:.0%})".replace("%", " %"),
+        len(rows),
+        f"{fmean(row['return'] for row in rows):.1f}",
+        f"{fmean(row['steps'] for row in rows):.0f}",
+        f"{fmean(row['minutes'] for row in rows):.1f}",
+    )
+
+
+def tables(rows: Rows) -> str:
+    """Two tables: imitation beside its teacher and at other sizes, and learning from rewards."""
+    tasks = sorted({row["task"] for row in rows})
+    return f"{_imitation(rows, tasks)}\n{_from_rewards(rows, tasks)}"
+
+
+def _imitation(rows: Rows, tasks: Iterable[str]) -> str:
+    sizes = sorted({row["size"] for row in rows if row["method"] == "transfer"})
+    head = ["task", "replay", "script", "its return", "imitation", "its return", "steps", "minutes"]
+    lines = []
+    for task in tasks:
+        cells = [f"`{task}`"]
+        for method, names in (
+            ("replay", ("share",)),
+            ("script", ("share", "mean")),
+            ("imitate", ("share", "mean", "steps", "minutes")),
+        ):
+            cells += _cells(_of(rows, task, method), names)
+        for size in sizes:
+            cells += _cells(
+                [r for r in _of(rows, task, "transfer") if r["size"] == size], ("share",)
+            )
+        lines.append(cells)
+    return _markdown([*head, *(f"{size} x {size}" for size in sizes)], lines)
+
+
+def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
+    names = ("seeds", "share", "mean", "steps", "minutes")
+    lines = []
+    for task in tasks:
+        for method in (*FROM_REWARDS, "plan"):
+            mine = _of(rows, task, method)
+            for budget in sorted({row["budget"] for row in mine}):
+                same = [row for row in mine if row["budget"] == budget]
+                lines.append([f"`{task}`", method.upper(), *_cells(same, names)])
+    head = ["task", "method", "seeds", "success", "return", "steps", "minutes"]
+    return _markdown(head, lines)
+
+
+def _of(rows: Rows, task: str, method: str) -> Rows:
+    return [row for row in rows if (row["task"], row["method"]) == (task, method)]
+
+
+def _cells(rows: Rows, names: Sequence[str]) -> list[str]:
+    """Values of pooled rows; nothing for values that were not measured."""
+    found = pooled(rows) if rows else None
+    return [str(getattr(found, name)) if found else "" for name in names]
+
+
+def _markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    cells = [head, ["---"] * len(head), *lines]
+    return "".join("| " + " | ".join(line) + " |\n" for line in cells)
+
+
+def with_tables(text: str, rows: Rows) -> str:
+    """The text of a page with the tables between the lines `MARKS`."""
+    begin, end = MARKS
+    before, found, rest = text.partition(begin)
+    _, ended, after = rest.partition(end)
+    if not (found and ended):
+        raise ValueError(f"the page must have lines {begin!r} and {end!r}")
+    return "".join([before, begin, tables(rows), end, after])
+
+
+def listing(rows: Rows) -> str:
+    """A table of all rows."""
+    head = ["task", "size", "method", "seed", "success", "return", "steps", "minutes", "revision"]
+    lines = [
+        [
+            *(str(row[name]) for name in ("task", "size", "method", "seed")),
+            *_cells([row], ("share", "mean", "steps", "minutes")),
+            row["revision"],
+        ]
+        for row in sorted(rows, key=lambda r: (r["task"], METHODS.index(r["method"]), r["seed"]))
+    ]
+    return _markdown(head, lines)
