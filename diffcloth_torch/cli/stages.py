@@ -9,6 +9,7 @@ from typing import Any
 
 from diffcloth_torch.checkpoint import check_like
 from diffcloth_torch.config.train_schema import ImitateStage, PlanStage
+from diffcloth_torch.envs.env import steps_made
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import Plans, Policy, TrainerOptions, imitate, plan
 from diffcloth_torch.learn.rollouts import MakeEnv
@@ -23,7 +24,8 @@ class Stages:
     An interrupted stage is repeated with the same bits, which its seed determines.
 
     Attributes:
-        done: Kind and duration [s] of each completed stage; also the success of plans.
+        done: Kind, environment steps and duration [s] of each completed stage; also the success of
+            plans.
         policy: Policy of the last stage of the kind "imitate"; None before.
     """
 
@@ -50,6 +52,11 @@ class Stages:
         self.policy: Policy | None = None
 
     @property
+    def steps(self) -> int:
+        """Environment steps of the completed stages."""
+        return int(sum(each["steps"] for each in self.done))
+
+    @property
     def seconds(self) -> float:
         """Duration of the completed stages [s]."""
         return float(sum(each["seconds"] for each in self.done))
@@ -61,13 +68,14 @@ class Stages:
             keep: Function that is called after each stage, to save results.
         """
         for stage in self._stages[len(self.done) :]:
-            before = time.perf_counter()
+            before, steps = time.perf_counter(), steps_made()
             found: dict[str, Any] = {"kind": stage.kind}
             if isinstance(stage, PlanStage):
                 self._plans = self._planned(stage)
                 found["success"] = float(self._plans.success.float().mean())
             else:
                 self.policy = self._imitated(stage)
+            found["steps"] = steps_made() - steps
             self.done.append(found | {"seconds": time.perf_counter() - before})
             keep()
 
@@ -95,7 +103,7 @@ class Stages:
             raise InvalidInput("`stages` must have the keys done, plans, policy")
         kinds = [stage.kind for stage in self._stages]
         for k, (each, kind) in enumerate(zip(kept["done"], kinds, strict=False)):
-            example: dict[str, Any] = {"kind": "", "seconds": 0.0}
+            example: dict[str, Any] = {"kind": "", "steps": 0, "seconds": 0.0}
             if kind == "plan":
                 example["success"] = 0.0
             check_like(f"`stages`.done[{k}]", each, example)

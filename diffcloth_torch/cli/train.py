@@ -245,8 +245,8 @@ class _Job:
         best = f"seed {self.trainer.options.seed}, the best of {seeds}: " if seeds else ""
         return best + (
             f"success {found['success']:.0%} ({low:.0%} to {high:.0%}) in {found['episodes']} "
-            f"fresh episodes, return {found['return']:.4g}, {found['steps']} environment steps of "
-            f"updates, {found['minutes']:.1f} minutes; results are in {out}"
+            f"fresh episodes, return {found['return']:.4g}, {found['steps']} environment steps, "
+            f"{found['minutes']:.1f} minutes; results are in {out}"
         )
 
     def _begin_at_stages(self) -> None:
@@ -406,7 +406,7 @@ class _Job:
             **shares,
             "interval": list(found.interval),
             "return": found.mean_return,
-            "steps": self.trainer.steps,
+            "steps": self._stages.steps + self.trainer.steps,
             "minutes": evaluations[-1]["seconds"] / 60,
         }
 

@@ -28,9 +28,22 @@ from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State, where
 from diffcloth_torch.sim.simulator import Simulator
 
-__all__ = ["FRAMES", "EnvState", "Task", "graded", "lengths"]
+__all__ = ["FRAMES", "EnvState", "Task", "add_steps", "graded", "lengths", "steps_made"]
 
 FRAMES = ("task", "world")
+
+_made = 0  # environment steps of this process, and of workers on its behalf
+
+
+def steps_made() -> int:
+    """Return the number of environment steps of this process, and of its workers."""
+    return _made
+
+
+def add_steps(count: int) -> None:
+    """Count environment steps."""
+    global _made
+    _made += count
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +246,7 @@ class Task(ABC):
             actions: Actions in the frame of the task, float64 [B, A], clipped to -1 .. 1.
             parameters: Parameters of the simulation; None means the parameters of the scene.
         """
+        add_steps(len(env))
         state = env.state
         failed = blocked = torch.zeros_like(env.failed)
         parameters = self._randomization.parameters(env.drawn, parameters)

@@ -25,7 +25,7 @@ from diffcloth_torch.checkpoint import (
     write_checkpoint,
 )
 from diffcloth_torch.checks import check_count
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, add_steps, steps_made
 from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
@@ -361,9 +361,10 @@ def _improved(make: Callable[[int, int | None], ClothVectorEnv], piece: _Piece) 
         return improve(env, start, piece.knots, piece.iterations, piece.rate)
 
 
-def _improved_remotely(work: tuple[bytes, _Piece]) -> Improved:
-    """Improve plans in this process, whose environments are reused."""
-    return _improved(partial(_made, work[0]), work[1])
+def _improved_remotely(work: tuple[bytes, _Piece]) -> tuple[Improved, int]:
+    """Improve plans in this process, whose environments are reused; also count its steps."""
+    before = steps_made()
+    return _improved(partial(_made, work[0]), work[1]), steps_made() - before
 
 
 @lru_cache(maxsize=8)
@@ -385,7 +386,9 @@ def _stage(
     if workers is None:
         return Improved.together([_improved(local, piece) for piece in pieces])
     name = pickled("plan: with `workers`, `make`", make)
-    return Improved.together(list(workers.map(_improved_remotely, [(name, p) for p in pieces])))
+    found = list(workers.map(_improved_remotely, [(name, p) for p in pieces]))
+    add_steps(sum(steps for _, steps in found))
+    return Improved.together([improved for improved, _ in found])
 
 
 _Stage = Callable[[Sequence[_Piece]], Improved]

@@ -69,6 +69,9 @@ def test_a_policy_that_only_imitates_is_the_one_of_imitate(tmp_path):
         assert torch.equal(kept[f"actor.{name}"], tensor), name
     record = record_of(out)
     assert [each["kind"] for each in record["stages"]] == ["imitate"]
+    steps = 2 * 2 * 4  # rounds, episodes, transitions
+    assert record["stages"][0]["steps"] == record["report"]["steps"] == steps
+    assert f"{steps} environment steps, " in result.output
     fresh = evaluate(MAKE, load_policy(out / "policy.pt"), 3, purpose_seed(3, "report"))
     assert record["report"]["return"] == fresh.mean_return
     assert record["evaluations"][0]["updates"] == record["evaluations"][-1]["updates"] == 0
@@ -83,6 +86,19 @@ def test_updates_begin_at_the_policy_of_the_stages(tmp_path):
     assert [e["updates"] for e in second["evaluations"]] == [0, 2]
     assert [each["kind"] for each in second["stages"]] == ["plan", "imitate"]
     assert "success" in second["stages"][0]
+    steps = [each["steps"] for each in second["stages"]]
+    assert second["report"]["steps"] == sum(steps) + 2 * 2 * 4  # updates, environments, transitions
+
+
+def test_steps_of_workers_count(tmp_path):
+    config = configured(tmp_path, PLAN, PLANS)
+    alone, shared = tmp_path / "alone", tmp_path / "shared"
+    assert call(config, "--out", alone, "--debug").exit_code == 0
+    workers = "workers={kind: processes, count: 1}"
+    assert call(config, "--out", shared, "--set", workers, "--debug").exit_code == 0
+    steps = [[each["steps"] for each in record_of(out)["stages"]] for out in (alone, shared)]
+    assert steps[0] == steps[1]
+    assert steps[0][0] >= 4 * 4  # plans are improved three times
 
 
 @pytest.mark.parametrize("at", [1, 2])

@@ -143,7 +143,7 @@ def test_the_best_policy_is_kept_and_reported(config, tmp_path, looks):
     line = (
         f"success 0% ({low:.0%} to {high:.0%}) in 3 fresh episodes, return {report['return']:.4g}"
     )
-    steps = "48 environment steps of updates"
+    steps = "48 environment steps"
     assert f"{line}, {steps}, {report['minutes']:.1f} minutes" in result.output
     assert record["starts"] == {
         "undo": [],
