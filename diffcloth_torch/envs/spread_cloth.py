@@ -174,7 +174,7 @@ class FlingCloth(SpreadCloth):
     """
 
     name = "FlingCloth"
-    steps = 82
+    steps = 86
     directions = 1
     steepness = (1.6, 1.9)
     _ALLOWED = 0.08
@@ -216,6 +216,6 @@ class FlingCloth(SpreadCloth):
         corners = at(env.state.positions, env.drawn["picked"])
         corners = torch.where((env.elapsed < _CLOSED)[:, None, None], corners, here)
         points = [corners, corners, *[foot + 1.15 * up] * 2, *laid, end, end, end + 0.1 * up]
-        times = [7, _CLOSED, 24, 30, *(33 + 4 * k for k in range(7)), 63, 65, 68]
+        times = [7, _CLOSED, 27, 33, *(36 + 4 * k for k in range(7)), 66, 68, 71]
         grasps = [-1.0, *[1.0] * (len(times) - 2), -1.0]
         return self.moves_to(env, *follow(env, times, points, grasps))
