@@ -12,6 +12,18 @@ from diffcloth_torch.learn.evaluation import wilson
 
 MARKS = "<!-- methods -->\n", "<!-- end of methods -->\n"  # around the tables on a page
 Rows = Sequence[Mapping[str, Any]]
+# Of the first table: the columns of each method, with attributes of `Pooled`.
+_COLUMNS = {
+    "replay": [("replay", "share")],
+    "script": [("script", "share"), ("its return", "mean")],
+    "imitate": [
+        ("imitation", "share"),
+        ("its return", "mean"),
+        ("seeds", "seeds"),
+        ("steps", "steps"),
+        ("minutes", "minutes"),
+    ],
+}
 
 
 @dataclass(frozen=True)
@@ -55,21 +67,15 @@ def tables(rows: Rows) -> str:
 
 def _imitation(rows: Rows, tasks: Iterable[str]) -> str:
     sizes = sorted({row["size"] for row in rows if row["method"] == "transfer"})
-    head = ["task", "replay", "script", "its return", "imitation", "its return", "steps", "minutes"]
+    head = ["task", *(title for columns in _COLUMNS.values() for title, _ in columns)]
     lines = []
     for task in tasks:
-        cells = [f"`{task}`"]
-        for method, names in (
-            ("replay", ("share",)),
-            ("script", ("share", "mean")),
-            ("imitate", ("share", "mean", "steps", "minutes")),
-        ):
-            cells += _cells(_of(rows, task, method), names)
+        line = [f"`{task}`"]
+        for method, columns in _COLUMNS.items():
+            line += _cells(_of(rows, task, method), [name for _, name in columns])
         for size in sizes:
-            cells += _cells(
-                [r for r in _of(rows, task, "transfer") if r["size"] == size], ("share",)
-            )
-        lines.append(cells)
+            line += _cells([r for r in _of(rows, task, "transfer") if r["size"] == size], ["share"])
+        lines.append(line)
     return _markdown([*head, *(f"{size} x {size}" for size in sizes)], lines)
 
 
