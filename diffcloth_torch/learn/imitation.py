@@ -37,6 +37,7 @@ _NOISE = 0.1  # standard deviation of the noise on the actions of a teacher in t
 _NOISY = 0.5  # share of these actions that have noise
 _RATE = 3e-3  # initial learning rate of Adam; it falls to 0 along a cosine
 _BATCH = 256
+_DECAY = 1.0  # weight decay for plans as a teacher, whose starts are few
 
 
 @called("imitate")
@@ -112,12 +113,18 @@ def imitate(
             shown.append(actions)
             if k == 0:
                 policy.scale.see(observations)
-            fit(policy, torch.cat(seen), torch.cat(shown), iterations, noise)
+            decay = _DECAY if isinstance(checked, Plans) else 0.0
+            fit(policy, torch.cat(seen), torch.cat(shown), iterations, noise, decay)
     return policy
 
 
 def fit(
-    policy: Policy, seen: Tensor, shown: Tensor, iterations: int, draws: torch.Generator
+    policy: Policy,
+    seen: Tensor,
+    shown: Tensor,
+    iterations: int,
+    draws: torch.Generator,
+    decay: float = 0.0,
 ) -> float:
     """Fit the actor to actions [n, A] of observations [n, O]; return the last loss.
 
@@ -127,8 +134,19 @@ def fit(
         shown: Actions.
         iterations: Number of steps of Adam.
         draws: Generator that draws the batches.
+        decay: Weight decay of AdamW; it does not apply to knots, which are actions.
     """
-    adam = torch.optim.Adam(policy.actor.parameters(), lr=_RATE)
+    groups: dict[bool, list[torch.nn.Parameter]] = {True: [], False: []}
+    for name, parameter in policy.actor.named_parameters():
+        groups[name.endswith("knots")].append(parameter)
+    adam = torch.optim.AdamW(
+        [
+            {"params": parameters, "weight_decay": 0.0 if fixed else decay}
+            for fixed, parameters in groups.items()
+            if parameters
+        ],
+        lr=_RATE,
+    )
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, iterations)
     loss = cpu.zeros(())
     for _ in range(iterations):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -38,10 +38,16 @@ from diffcloth_torch.operations import called
 __all__ = ["Improved", "Plans", "improve", "knots_of", "plan"]
 
 _CHECKPOINT = "plans"  # kind of the files of `Plans.save`
-_TOGETHER = 2  # starts of a piece
+_TOGETHER, _REPLAYED = 2, 8  # plans of a piece of improvements, and of replays
 _BETAS = (0.9, 0.95)  # decay rates of Adam
 _RATE, _LAST_SHARE = 0.1, 0.1  # initial learning rate of Adam, and its final share
-_NOISE = 0.2  # standard deviation of the noise of initial knots
+_LAST_WEIGHT = 3.0  # additional weight of the last rewards, in which success is read
+_NOISE = 0.2  # standard deviation of the noise of initial knots, common and of each
+_DRAWS = 16  # initial knots of an attempt, of which the best are improved
+_ROUNDS = 3  # largest number of repeated searches of starts without success
+_NEIGHBORS = 3  # starts whose plans are tried from another start
+_RIDGE = 0.1  # penalty of the linear function, relative to the mean square of its observations
+_LEAST = 1e-6  # observations with a smaller deviation are constant
 _LARGEST_KNOT = 0.995  # first actions are clipped to this before atanh
 _SHARE = 3  # divides iterations and rate of plans that begin from good ones
 _LARGEST_COUNT = 10**6
@@ -137,12 +143,19 @@ def plan(
 ) -> Plans:
     """Find one plan for each of several starts, by gradients of their returns.
 
-    First, each attempt optimizes a plan of one start, beginning with noise around the task's first
-    action. Each of these plans is then replayed from all starts, and the search of each start
-    continues from the best plan for it, with a third of the iterations. The best iterate of a start
-    is kept, by success and then by return. Adam updates the knots of a plan, with betas of
-    (.9, .95) and a learning rate that falls linearly from .1 to .01, or from a third of these rates
-    in the second search; the gradient of each start is divided by its own norm.
+    First, each attempt optimizes a plan of one start. It replays random plans near the task's first
+    action, without gradients, and improves the best of them. Each of these plans is then replayed
+    from all starts, and the search of each start continues from the best plan for it, with a third
+    of the iterations. A search continues from plans of other starts: the search of a start without
+    success is repeated, at most three times, and at last the search of all starts. It then begins
+    with the best of the start's own plan, the plans of the three nearest starts with success, and a
+    linear function of the first observation, fitted to all plans with success.
+
+    The best iterate of a start is kept, by success and then by return. Until a plan succeeds, the
+    rewards of the last `holds` transitions, in which success is read, count four times. Adam
+    updates the knots of a plan, with betas of (.9, .95) and a learning rate that falls linearly
+    from .1 to .01, or from a third of these rates after the attempts; the gradient of each start is
+    divided by its own norm.
 
     Infeasible motions and failed simulations receive the worst reward and have no gradient: a plan
     is updated by the gradients of its other rewards.
@@ -151,15 +164,15 @@ def plan(
         make: Makes environments: `functools.partial(dc.envs.make, "FoldCloth", size=7,
             opens_at=-1.0, reach=.06)`.
         episodes: E, the number of starts.
-        attempts: Number of plans that are found from noise, of at most E different starts.
+        attempts: Number of plans that are found from random plans, of at most E different starts.
         knots: Number of hat functions of the time.
-        iterations: Updates of a plan that begins from noise.
+        iterations: Updates of a plan of an attempt.
         seed: Seed of the starts and of the noise.
         workers: Workers that compute plans; None: this process, in one thread. Results have the
             same bits for any workers.
         coarse: Vertices a side of a coarser sheet, for which `make` is called with `size=coarse`:
-            plans are found there first, with all attempts, and then improved for the sheet of
-            `make`. None: no such stage.
+            plans are found there first, and then improved for the sheet of `make`. None: no such
+            stage.
 
     Raises:
         InvalidInput: If an argument is not accepted.
@@ -176,21 +189,22 @@ def plan(
     if coarse is not None:
         check_count("plan: `coarse`", coarse, 4, _LARGEST_COUNT)
     task = make(num_envs=1).task
+    check_memory("plan: `knots`", knots, _DRAWS * attempts * task.action_size * 8, "a knot")
     check_memory("plan: `knots`", knots, episodes * task.action_size * 8, "a knot")
     check_memory("plan: `episodes`", episodes, task.horizon * task.action_size * 8, "an episode")
+    if coarse is not None:
+        _require_same_actions(make, coarse)
     seeds = part_seeds(seed, 0, episodes)
     draws = cpu.generator().manual_seed(seed)
     first = cpu.tensor(task.first_action).clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
-    noise = cpu.randn(attempts, knots, len(first), generator=draws, dtype=torch.float64)
-    begun = first + _NOISE * noise
-    stage = partial(_stage, make, lru_cache(maxsize=8)(partial(_sized, make)), workers)
-    if coarse is not None:
-        _require_same_actions(make, coarse)
-        some = stage(_attempts(seeds, begun, iterations, coarse))
-        found = _refined(stage, seeds, some.knots, iterations, coarse)
-        return _refined(stage, seeds, found.knots, iterations, None).plans(seeds)
-    some = stage(_attempts(seeds, begun, iterations, None))
-    return _refined(stage, seeds, some.knots, iterations, None).plans(seeds)
+    sized = lru_cache(maxsize=8)(partial(_sized, make))
+    stage = partial(_stage, make, sized, workers)
+    sizes = [None] if coarse is None else [coarse, None]
+    search = _Search(stage, sized, seeds, iterations, sizes[0])
+    found = search.solved(search.attempts(_drawn(first, attempts, knots, len(seeds), draws)).knots)
+    for size in sizes[1:]:
+        found = _Search(stage, sized, seeds, iterations, size).solved_from(found)
+    return found.plans(seeds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +231,16 @@ class Improved:
             *(
                 torch.where(wins.reshape(-1, *[1] * (mine.dim() - 1)), yours, mine)
                 for mine, yours in zip(self._parts(), other._parts(), strict=True)
+            )
+        )
+
+    def replaced(self, rows: Sequence[int], others: Improved) -> Improved:
+        """Return these iterates with some rows replaced by others."""
+        places = cpu.tensor(list(rows), dtype=torch.int64)
+        return Improved(
+            *(
+                mine.index_copy(0, places, yours)
+                for mine, yours in zip(self._parts(), others._parts(), strict=True)
             )
         )
 
@@ -249,6 +273,8 @@ def improve(
 ) -> Improved:
     """Improve plans of environments from a given state, each by its own gradient.
 
+    Until a plan succeeds, the last `holds` rewards count more.
+
     Args:
         env: Environments whose task and parameters are used; their state remains unchanged.
         start: States after equally many transitions in all environments, without a graph.
@@ -273,11 +299,12 @@ def improve(
         actions = before.detach().tanh()
         leaf = actions.clone().requires_grad_(k < iterations)
         with torch.set_grad_enabled(k < iterations):
-            returns, success = _followed(env, start, leaf)
+            returns, last, success = _followed(env, start, leaf)
         found = Improved(free.detach().clone(), actions, returns.detach(), success)
         best = found if best is None else best.better(found)
         if k < iterations and returns.requires_grad:
-            (slope,) = torch.autograd.grad(returns.sum(), leaf)
+            objective = returns + torch.where(best.success, 0.0, _LAST_WEIGHT * last)
+            (slope,) = torch.autograd.grad(objective.sum(), leaf)
             (free.grad,) = torch.autograd.grad(before.tanh(), free, -_normalized(env, slope, k))
             adam.param_groups[0]["lr"] = rate * (1 - (1 - _LAST_SHARE) * k / max(iterations - 1, 1))
             with cpu.DEVICE:  # device of the step counts of Adam
@@ -292,28 +319,41 @@ def hats(horizon: int, knots: int) -> Tensor:
     return (1 - (times - cpu.arange(knots)).abs()).clamp(min=0)
 
 
-def knots_of(actions: Tensor, knots: int) -> Tensor:
-    """Fit knots before tanh [E, K, A] to actions [E, T, A], by least squares before tanh."""
-    shares = hats(actions.shape[1], knots)
+def knots_of(actions: Tensor, knots: int, done: int = 0) -> Tensor:
+    """Fit knots before tanh [E, K, A] to actions [E, T - done, A], by least squares before tanh.
+
+    Knots on which only the first `done` transitions depend are zero.
+    """
+    shares = hats(done + actions.shape[1], knots)[done:]
     before = actions.clamp(-_LARGEST_KNOT, _LARGEST_KNOT).atanh()
     return torch.stack([torch.linalg.lstsq(shares, each, driver="gelsd")[0] for each in before])
 
 
-def _followed(env: ClothVectorEnv, start: EnvState, actions: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute returns [n] and successes [n] of actions [n, T, A] from a state."""
+def _followed(
+    env: ClothVectorEnv, start: EnvState, actions: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Follow actions [n, T, A] from a state.
+
+    Returns:
+        Returns [n], their parts from the last `holds` transitions [n], and successes [n].
+    """
     task, place = env.task, start
     returns = cpu.zeros(len(start))
+    last = cpu.zeros(len(start))
     success = cpu.zeros(len(start), dtype=torch.bool)
     running = ~success
     for k in range(actions.shape[1]):
         place = task.transition(place, actions[:, k], env.parameters)
-        returns = returns + torch.where(running, task.outcome(place), 0.0)
+        outcome = torch.where(running, task.outcome(place), 0.0)
+        returns = returns + outcome
+        if k >= actions.shape[1] - task.holds:
+            last = last + outcome
         success = torch.where(running, task.succeeded(place) & ~place.failed, success)
         running = running & ~task.terminal(place)
         if not bool(running.any()):
             break
     _require_finite(env, "return", returns.detach())
-    return returns, success
+    return returns, last, success
 
 
 def _normalized(env: ClothVectorEnv, slope: Tensor, iteration: int) -> Tensor:
@@ -394,34 +434,131 @@ def _stage(
 _Stage = Callable[[Sequence[_Piece]], Improved]
 
 
-def _attempts(
-    seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
-) -> list[_Piece]:
-    """Return pieces for plans from noise: attempt k for start k modulo E."""
-    chosen = [seeds[k % len(seeds)] for k in range(len(knots))]
-    return _pieces(_Piece(chosen, knots, iterations, _RATE, size))
+def _drawn(first: Tensor, attempts: int, knots: int, starts: int, draws: torch.Generator) -> Tensor:
+    """Draw initial knots of attempts [attempts, D, K, A] about the first action [A].
+
+    The first draw of the first attempt of a start is without noise.
+    """
+    sizes = (attempts, _DRAWS, knots, len(first))
+    noise = cpu.randn(*sizes, generator=draws, dtype=torch.float64)
+    noise = noise + cpu.randn(*sizes[:2], 1, len(first), generator=draws, dtype=torch.float64)
+    noise[:starts, 0] = 0.0
+    return first + _NOISE * noise
 
 
-def _refined(
-    stage: _Stage, seeds: Sequence[int], knots: Tensor, iterations: int, size: int | None
-) -> Improved:
-    """Replay all plans from all starts, and improve the best plan of each start."""
-    count = len(knots)
-    tried = stage([_Piece([seed] * count, knots, 0, _RATE, size) for seed in seeds])
-    best = [
-        first + tried.rows(range(first, first + count)).best()
-        for first in range(0, len(seeds) * count, count)
-    ]
-    few = math.ceil(iterations / _SHARE)
-    return stage(_pieces(_Piece(list(seeds), tried.knots[best], few, _RATE / _SHARE, size)))
+class _Search:
+    """A search of plans for several starts, with a sheet of one size."""
+
+    def __init__(
+        self,
+        stage: _Stage,
+        sized: Callable[[int, int | None], ClothVectorEnv],
+        seeds: Sequence[int],
+        iterations: int,
+        size: int | None,
+    ) -> None:
+        self._stage, self._seeds, self._iterations, self._size = stage, seeds, iterations, size
+        env = sized(1, size)
+        seen = torch.cat([env.reset(seed=[seed])[0].double() for seed in seeds])
+        scale = seen.std(dim=0, correction=0)
+        centered = seen - seen.mean(dim=0)
+        self._seen = torch.where(scale > _LEAST, centered / scale.clamp(min=_LEAST), 0.0)  # [E, O]
+
+    def attempts(self, drawn: Tensor) -> Improved:
+        """Improve the best of the drawn knots [attempts, D, K, A] of each attempt."""
+        starts = [k % len(self._seeds) for k in range(len(drawn))]
+        best = self._best_of(
+            [(start, list(each)) for start, each in zip(starts, drawn, strict=True)]
+        )
+        return self._improved(starts, best.knots, self._iterations, _RATE)
+
+    def solved(self, knots: Tensor) -> Improved:
+        """Search plans of all starts; begin with the best of common knots [n, K, A] for each."""
+        rows = list(range(len(self._seeds)))
+        return self._chained(self._refined([(row, list(knots)) for row in rows]))
+
+    def solved_from(self, found: Improved) -> Improved:
+        """Search plans of all starts; begin with plans of these starts, found for another size."""
+        rows = list(range(len(self._seeds)))
+        return self._chained(self._refined(self._candidates(rows, found)))
+
+    def _chained(self, found: Improved) -> Improved:
+        """Repeat the search of starts without success, and at last of all starts."""
+        for _ in range(_ROUNDS):
+            rows = (~found.success).nonzero()[:, 0].tolist()
+            if not rows:
+                break
+            found = self._again(rows, found)
+        return self._again(list(range(len(self._seeds))), found)
+
+    def _again(self, rows: Sequence[int], found: Improved) -> Improved:
+        return found.replaced(rows, self._refined(self._candidates(rows, found)))
+
+    def _candidates(self, rows: Sequence[int], found: Improved) -> list[tuple[int, list[Tensor]]]:
+        """Knots from which the search of some starts can continue.
+
+        These are the knots of the start, of the nearest starts with success, and a linear function
+        of the observation that is fitted to the knots of all starts with success.
+        """
+        donors = found.success.nonzero()[:, 0].tolist() or list(range(len(self._seeds)))
+        apart = torch.cdist(self._seen[list(rows)], self._seen[donors])
+        fitted = _fitted(self._seen[donors], found.knots[donors], self._seen[list(rows)])
+        candidates = []
+        for row, distances, guess in zip(rows, apart, fitted, strict=True):
+            near = [donors[k] for k in distances.argsort(stable=True).tolist()]
+            others = [donor for donor in near if donor != row][:_NEIGHBORS]
+            candidates.append((row, [found.knots[k] for k in (row, *others)] + [guess]))
+        return candidates
+
+    def _refined(self, candidates: Sequence[tuple[int, list[Tensor]]]) -> Improved:
+        """Improve the best candidate of each start."""
+        best = self._best_of(candidates)
+        few = math.ceil(self._iterations / _SHARE)
+        return self._improved([start for start, _ in candidates], best.knots, few, _RATE / _SHARE)
+
+    def _best_of(self, candidates: Sequence[tuple[int, list[Tensor]]]) -> Improved:
+        """Replay candidates, and return the best one of each start."""
+        starts = [start for start, each in candidates for _ in each]
+        knots = torch.stack([one for _, each in candidates for one in each])
+        tried = self._improved(starts, knots, 0, _RATE, _REPLAYED)
+        best, first = [], 0
+        for _, each in candidates:
+            best.append(first + tried.rows(range(first, first + len(each))).best())
+            first += len(each)
+        return tried.rows(best)
+
+    def _improved(
+        self,
+        starts: Sequence[int],
+        knots: Tensor,
+        iterations: int,
+        rate: float,
+        together: int = _TOGETHER,
+    ) -> Improved:
+        seeds = [self._seeds[start] for start in starts]
+        # Pieces have a fixed size, which does not depend on the number of workers.
+        return self._stage(
+            [
+                _Piece(
+                    seeds[k : k + together], knots[k : k + together], iterations, rate, self._size
+                )
+                for k in range(0, len(seeds), together)
+            ]
+        )
 
 
-def _pieces(whole: _Piece) -> list[_Piece]:
-    """Split a piece into parts of a fixed size, independent of the number of workers."""
-    return [
-        replace(whole, seeds=whole.seeds[k : k + _TOGETHER], knots=whole.knots[k : k + _TOGETHER])
-        for k in range(0, len(whole.seeds), _TOGETHER)
-    ]
+def _fitted(seen: Tensor, knots: Tensor, wanted: Tensor) -> Tensor:
+    """Fit knots [n, K, A] by a linear function of observations [n, O], with a ridge penalty.
+
+    Returns:
+        Values of the function for the observations `wanted` [m, O], [m, K, A].
+    """
+    middle, mean = seen.mean(dim=0), knots.mean(dim=0)
+    inner, outer = seen - middle, wanted - middle
+    products = inner @ inner.T
+    ridge = _RIDGE * products.diagonal().mean().clamp(min=_LEAST) * cpu.eye(len(seen))
+    weights = torch.linalg.solve(products + ridge, (knots - mean).flatten(1))
+    return mean + (outer @ inner.T @ weights).reshape(-1, *mean.shape)
 
 
 def _require_same_actions(make: MakeEnv, coarse: int) -> None:

@@ -102,8 +102,10 @@ class Replanning:
         env, done = self._env, int(place.elapsed[0])
         here = policy.scale(env.task.observation(place).to(torch.float32))
         near = torch.cdist(here, policy.scale(self._seen[:, done])).argmin(dim=1)
+        tried = improve(env, place, self._knots[near], 0)
+        tried = tried.better(improve(env, place, self._continued(place, policy), 0))
         with torch.enable_grad():
-            found = improve(env, place, self._knots[near], _ITERATIONS, _RATE)
+            found = improve(env, place, tried.knots, _ITERATIONS, _RATE)
         counts = ~lost & (found.success | ~self._success[near])
         actions = (hats(env.task.horizon, _KNOTS)[done:] @ found.knots).tanh()
         seen, kept = _watched(env, place, actions)
@@ -113,6 +115,15 @@ class Replanning:
         self._knots = torch.cat([self._knots, found.knots[counts]])
         self._success = torch.cat([self._success, found.success[counts]])
         return seen[kept], actions.to(torch.float32)[kept]
+
+    def _continued(self, place: EnvState, policy: Policy) -> Tensor:
+        """Fit knots [B, K, A] to the actions of the policy in the rest of the episodes."""
+        env, done, actions = self._env, int(place.elapsed[0]), []
+        for _ in range(env.task.horizon - done):
+            seen = env.task.observation(place).to(torch.float32)
+            actions.append(policy(seen).double())
+            place = env.task.transition(place, actions[-1], env.parameters)
+        return knots_of(torch.stack(actions, dim=1), _KNOTS, done)
 
 
 def _watched(env: ClothVectorEnv, place: EnvState, actions: Tensor) -> tuple[Tensor, Tensor]:

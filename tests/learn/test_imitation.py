@@ -10,8 +10,9 @@ import torch
 from diffcloth_torch import envs
 from diffcloth_torch.envs.fold_cloth import FoldCloth
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.learn import Trainer, TrainerOptions, imitate, plan
-from diffcloth_torch.learn.plans import improve
+from diffcloth_torch.learn import Policy, Trainer, TrainerOptions, imitate, imitation, plan
+from diffcloth_torch.learn.imitation import fit
+from diffcloth_torch.learn.plans import hats, improve
 from diffcloth_torch.learn.replanning import Replanning
 from diffcloth_torch.learn.starts import part_seeds
 
@@ -73,21 +74,67 @@ def test_the_first_round_follows_plans_and_later_rounds_plan_again():
     # The second round replans at the start, and at up to two later times of five transitions.
     assert len(seen) == len(shown) > 10
     assert len(lessons._knots) == len(lessons._seen) >= 3 + 2 * 2
-    # New plans begin from the nearest plans; five steps of .03 bound the distance.
+    # New plans begin from the nearest plans or the actions of the policy, the better ones; five
+    # steps of .03 bound the distance.
+    env.reset(seed=part_seeds(3, 1, 2))
+    start = env.env_state.detach()
     near = torch.cdist(policy.scale(first), policy.scale(lessons._seen[:3, 0])).argmin(dim=1)
-    moved = lessons._knots[3:5] - lessons._knots[near]
-    assert float(moved.abs().max()) < 0.2
-    old, new = (
-        improve(env, env.env_state, knots, 0).returns
-        for knots in (lessons._knots[near], lessons._knots[3:5])
-    )
-    assert bool((new >= old).all())
+    with torch.no_grad():
+        own = lessons._continued(start, policy)
+    nearest, continued = (improve(env, start, each, 0) for each in (lessons._knots[near], own))
+    begun = nearest.better(continued)
+    assert float((lessons._knots[3:5] - begun.knots).abs().max()) < 0.2
+    new = improve(env, start, lessons._knots[3:5], 0)
+    assert bool((new.returns >= begun.returns).all())
+
+
+def test_the_actions_of_a_policy_are_continued_from_the_middle_of_an_episode():
+    env = SOFT(num_envs=2)
+    env.reset(seed=[1, 2])
+    place = env.env_state.detach()
+    policy = imitate(SOFT, "scripted", **(FEW | {"rounds": 1}))
+    plans = plan(SOFT, episodes=1, attempts=1, knots=3, iterations=1)
+    lessons = Replanning(SOFT, env, plans, 3, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for k in range(2):
+            place = env.task.transition(place, 0.1 * plans.actions[:, k].expand(2, -1))
+        knots = lessons._continued(place, policy)
+        actions = (hats(5, 12)[2:] @ knots).tanh()
+        expected = policy(env.task.observation(place).float()).double()
+    torch.testing.assert_close(actions[:, 0], expected, atol=1e-5, rtol=0)
 
 
 def test_a_policy_learns_from_plans_with_the_same_bits():
     plans = plan(SOFT, episodes=2, attempts=1, knots=3, iterations=1)
     policies = [imitate(SOFT, plans, **FEW).state_dict() for _ in range(2)]
     assert all(torch.equal(value, policies[1][name]) for name, value in policies[0].items())
+
+
+def test_weight_decay_shrinks_all_weights_except_knots():
+    env = SOFT(num_envs=2)
+    options = TrainerOptions("apg", plan_knots=3, hidden=(8,), first_action=(0.5,) * 8)
+    seen, shown = torch.zeros(4, Policy(env, options).observations), torch.full((4, 8), 0.5)
+
+    def fitted(decay):
+        torch.manual_seed(0)
+        policy = Policy(env, options)
+        fit(policy, seen, shown, 30, torch.Generator().manual_seed(0), decay)
+        return policy.actor
+
+    kept, shrunk = fitted(0.0), fitted(20.0)
+    sizes = [float(actor.layers[0].weight.detach().norm()) for actor in (kept, shrunk)]
+    assert sizes[1] < 0.5 * sizes[0]
+    torch.testing.assert_close(shrunk.plan.knots, kept.plan.knots, atol=0.1, rtol=0)
+
+
+def test_plans_are_imitated_with_weight_decay(monkeypatch):
+    decays = []
+    monkeypatch.setattr(imitation, "fit", lambda *given: decays.append(given[5]))
+    plans = plan(SOFT, episodes=1, attempts=1, knots=2, iterations=1)
+    imitate(SOFT, plans, rounds=1, episodes=1)
+    imitate(SOFT, "scripted", rounds=1, episodes=1)
+    assert decays[0] > 0
+    assert decays[1] == 0
 
 
 def test_plans_of_other_episodes_are_refused():

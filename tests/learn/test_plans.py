@@ -51,6 +51,38 @@ def begun(count=2):
     return env, env.env_state.detach(), first.repeat(count, 3, 1)
 
 
+def improved_of(knots):
+    """Iterates whose knots, actions and returns are these numbers; above -1 they succeed."""
+    each = knots.reshape(-1, 1, 1)
+    return Improved(each, each, knots.reshape(-1), knots.reshape(-1) > -1)
+
+
+class Counted:
+    """Environments that observe the number of the start."""
+
+    def reset(self, seed):
+        return torch.tensor([[float(seed[0])]]), {}
+
+
+def searching(count):
+    """A search for starts 7, 8, .. without simulations, and its stages: seeds, knots, updates.
+
+    Updates change nothing. Plans of the start `search.stubborn` never succeed.
+    """
+    stages = []
+
+    def stage(pieces):
+        stages.append([(p.seeds, p.knots.flatten().tolist(), p.iterations) for p in pieces])
+        found = improved_of(torch.cat([piece.knots for piece in pieces]))
+        seeds = [seed for piece in pieces for seed in piece.seeds]
+        fails = torch.tensor([seed == getattr(search, "stubborn", None) for seed in seeds])
+        return Improved(found.knots, found.actions, found.returns, found.success & ~fails)
+
+    seeds = list(range(7, 7 + count))
+    search = plans_module._Search(stage, lambda *_: Counted(), seeds, 6, None)
+    return search, stages
+
+
 class TestPlan:
     def test_a_plan_replays_in_environments(self, found):
         assert len(found) == 3
@@ -99,26 +131,50 @@ class TestPlan:
         returns, _ = followed(MAKE, plans)
         torch.testing.assert_close(returns, plans.returns.float(), atol=1e-5, rtol=0)
 
-    def test_planning_continues_from_the_best_plan_of_each_start(self):
-        """Start 0 continues from plan 1, by return, and start 1 from plan 0, by success."""
-        knots = torch.arange(2.0, dtype=torch.float64)[:, None, None]
-        stages = []
+    def test_attempts_begin_with_the_best_draw(self):
+        """Returns are the first knots: attempt 0 continues from draw 1, attempt 1 from draw 0."""
+        search, stages = searching(2)
+        drawn = torch.tensor([[-1.0, 2.0], [1.0, -2.0]], dtype=torch.float64)[:, :, None, None]
+        found = search.attempts(drawn)
+        replays, improved = stages
+        assert replays == [([7, 7, 8, 8], [-1.0, 2.0, 1.0, -2.0], 0)]
+        assert improved == [([7, 8], [2.0, 1.0], 6)]
+        assert found.knots.flatten().tolist() == [2.0, 1.0]
 
-        def stage(pieces):
-            stages.append(pieces)
-            if len(stages) > 1:
-                return None
-            returns = torch.tensor([-3.0, -2.0, -2.0, -1.0], dtype=torch.float64)
-            success = torch.tensor([False, False, True, False])
-            return Improved(knots.repeat(2, 1, 1), knots.repeat(2, 1, 1), returns, success)
+    def test_a_start_without_success_continues_from_near_plans_and_a_linear_function(self):
+        """Starts observe 0, 1, .. 5, where knots of .0, .1, .. .5 succeed; start 3 has none."""
+        search, stages = searching(6)
+        knots = 0.1 * torch.arange(6.0, dtype=torch.float64)
+        knots[3] = -2.0
+        found = search.solved_from(improved_of(knots))
+        (again, _, last, _) = stages
+        pairs = [pair for seeds, each, _ in again for pair in zip(seeds, each, strict=True)]
+        tried = [knot for seed, knot in pairs if seed == 10]
+        assert tried[0] == -2.0
+        assert sorted(tried[1:4]) == pytest.approx([0.1, 0.2, 0.4])
+        assert tried[4] == pytest.approx(0.3, abs=0.03)  # the ridge penalty is small
+        assert found.success.all()
+        assert sum(len(piece[0]) for piece in last) == 6 * 5
 
-        plans_module._refined(stage, [7, 8], knots, 45, None)
-        replays, (improved,) = stages
-        assert [piece.seeds for piece in replays] == [[7, 7], [8, 8]]
-        assert [piece.iterations for piece in replays] == [0, 0]
-        assert improved.seeds == [7, 8]
-        assert improved.iterations == 15
-        assert improved.knots.flatten().tolist() == [1.0, 0.0]
+    def test_starts_with_success_are_searched_again_only_at_last(self):
+        search, stages = searching(3)
+        knots = torch.tensor([1.0, -5.0, 2.0], dtype=torch.float64)
+        search.stubborn = 8
+        found = search._chained(improved_of(knots))
+        improvements = [pieces for pieces in stages if pieces[0][2]]
+        seeds = [[seed for piece in pieces for seed in piece[0]] for pieces in improvements]
+        assert seeds == [[8]] * 3 + [[7, 8, 9]]
+        assert found.success.tolist() == [True, False, True]
+
+
+def test_a_linear_function_is_fitted_to_knots():
+    seen = torch.randn(9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    knots = (seen @ torch.arange(6.0, dtype=torch.float64).reshape(3, 2))[:, :, None] + 1.0
+    wanted = seen[:2]
+    found = plans_module._fitted(seen, knots, wanted)
+    assert float((found - knots[:2]).abs().max()) < 0.2 * float((knots[:2] - 1).abs().max())
+    alone = plans_module._fitted(seen[:1], knots[:1], wanted)
+    torch.testing.assert_close(alone, knots[:1].expand(2, -1, -1))
 
 
 class TestImprove:
@@ -150,6 +206,24 @@ class TestImprove:
         found = improve(env, start, knots, 3, rate=0.1)
         assert torch.equal(found.knots, knots)
         torch.testing.assert_close(found.actions, (hats(5, 3) @ knots).tanh())
+
+    @pytest.mark.parametrize("succeeds", [False, True])
+    def test_the_last_rewards_count_more_until_a_plan_succeeds(self, monkeypatch, succeeds):
+        """The rewards of the last two of five transitions count four times."""
+        env, start, knots = begun()
+        task = type(env.task)
+        monkeypatch.setattr(task, "holds", 2)
+        monkeypatch.setattr(task, "succeeded", lambda _, place: (place.held >= 0) & succeeds)
+        found = improve(env, start, knots, 1, rate=2e-3)
+        outcome = task.outcome
+        monkeypatch.setattr(plans_module, "_LAST_WEIGHT", 0.0)
+        if not succeeds:
+            monkeypatch.setattr(
+                task, "outcome", lambda t, p: outcome(t, p) * (1 + 3 * (p.elapsed > 3))
+            )
+        expected = improve(env, start, knots, 1, rate=2e-3)
+        torch.testing.assert_close(found.knots, expected.knots, atol=1e-9, rtol=0)
+        assert not torch.equal(found.knots, knots)
 
     def test_success_is_preferred_to_return(self):
         one = torch.ones(2, 1, 1, dtype=torch.float64)
