@@ -557,7 +557,7 @@ def _fitted(seen: Tensor, knots: Tensor, wanted: Tensor) -> Tensor:
     inner, outer = seen - middle, wanted - middle
     products = inner @ inner.T
     ridge = _RIDGE * products.diagonal().mean().clamp(min=_LEAST) * cpu.eye(len(seen))
-    weights = torch.linalg.solve(products + ridge, (knots - mean).flatten(1))
+    weights: Tensor = torch.linalg.solve(products + ridge, (knots - mean).flatten(1))
     return mean + (outer @ inner.T @ weights).reshape(-1, *mean.shape)
 
 
