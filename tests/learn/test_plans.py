@@ -156,7 +156,8 @@ class TestPlan:
         assert found.success.all()
         assert sum(len(piece[0]) for piece in last) == 6 * 5
 
-    def test_starts_with_success_are_searched_again_only_at_last(self):
+    def test_starts_with_success_are_searched_again_only_at_last(self, monkeypatch):
+        monkeypatch.setattr(plans_module, "_ROUNDS", 3)
         search, stages = searching(3)
         knots = torch.tensor([1.0, -5.0, 2.0], dtype=torch.float64)
         search.stubborn = 8
