@@ -555,7 +555,8 @@ def _fitted(seen: Tensor, knots: Tensor, wanted: Tensor) -> Tensor:
     products = inner @ inner.T
     ridge = _RIDGE * products.diagonal().mean().clamp(min=_LEAST) * cpu.eye(len(seen))
     weights = torch.linalg.solve(products + ridge, (knots - mean).flatten(1))
-    return mean + (outer @ inner.T @ weights).reshape(-1, *mean.shape)
+    fitted: Tensor = mean + (outer @ inner.T @ weights).reshape(-1, *mean.shape)
+    return fitted
 
 
 def _require_same_actions(make: MakeEnv, coarse: int) -> None:
