@@ -82,3 +82,9 @@ def test_a_report_has_no_other_attributes():
     with pytest.raises(AttributeError, match="'Report' object has no attribute 'iteration'"):
         report.iteration  # noqa: B018
     assert not hasattr(report, "__length_hint__")
+
+
+def test_the_dictionary_of_a_report_is_complete():
+    report = step(2).report
+    assert vars(report).keys() == {entry.name for entry in fields(Report)}
+    assert report.__dict__ is vars(report)

@@ -19,16 +19,23 @@ from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.contacts import Contacts
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 
-__all__ = ["Report", "combine_reports", "outcome_text"]
+__all__ = ["Report", "combine_reports", "outcome_text", "report_later"]
 
 
 def _nothing() -> None:
     return None
 
 
+class _WithFields:
+    """A class whose instances have a dictionary, which `Report.__dict__` completes first."""
+
+
+_fields_of: Callable[[Any], dict[str, Any]] = vars(_WithFields)["__dict__"].__get__
+
+
 @saved
 @dataclass(frozen=True, eq=False)
-class Report:
+class Report(_WithFields):
     """Outcome of a step, in Python numbers, or in tensors of shape [B] in a batch.
 
     Attributes:
@@ -118,35 +125,24 @@ class Report:
                     f"Report: `{entry}` must be a str or a tuple of them, got {names!r}"
                 )
 
-    @staticmethod
-    def later(status: str | tuple[str, ...], make: Callable[[], Report]) -> Report:
-        """Return a report that is made when another field than its status is first read.
-
-        Args:
-            status: Its status.
-            make: Makes the report; called at most once by a thread.
-        """
-        report = object.__new__(Report)
-        report.__dict__.update(status=status, _make=make)
-        return report
-
     if not TYPE_CHECKING:  # a type checker knows the fields
 
+        @property
+        def __dict__(self) -> dict[str, Any]:
+            own = _fields_of(self)
+            make = own.get("_make")
+            if make is not None:  # see `report_later`
+                own.update(vars(make()))
+                own.pop("_make", None)
+            return own
+
         def __getattr__(self, name: str) -> Any:
-            self._complete()
-            if name in self.__dict__:
-                return self.__dict__[name]
+            own = self.__dict__
+            if name in own:
+                return own[name]
             raise AttributeError(f"'Report' object has no attribute {name!r}")
 
-    def _complete(self) -> None:
-        own = self.__dict__
-        make = own.get("_make")
-        if make is not None:
-            own.update(vars(make()))
-            own.pop("_make", None)
-
     def __getstate__(self) -> dict[str, Any]:
-        self._complete()
         return dict(vars(self))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -197,6 +193,18 @@ class Report:
         """Choose environments of `a` where `mask` is true, else of `b`; None if one is missing."""
         batched = [report is not None and not isinstance(report.status, str) for report in (a, b)]
         return combine_reports(Choice(mask, batched), [a, b])
+
+
+def report_later(status: str | tuple[str, ...], make: Callable[[], Report]) -> Report:
+    """Return a report that is made when another field than its status is first read.
+
+    Args:
+        status: Its status.
+        make: Makes the report; called at most once by a thread.
+    """
+    report = object.__new__(Report)
+    _fields_of(report).update(status=status, _make=make)
+    return report
 
 
 def combine_reports(how: Combination, reports: Sequence[Report | None]) -> Report | None:

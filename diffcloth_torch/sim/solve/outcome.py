@@ -19,7 +19,7 @@ from diffcloth_torch.errors import (
 )
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.contacts import Contacts
-from diffcloth_torch.sim.records.report import Report
+from diffcloth_torch.sim.records.report import Report, report_later
 from diffcloth_torch.sim.solve.step import (
     CONVERGED,
     CRITERIA,
@@ -62,7 +62,7 @@ def later_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batche
     """Return the report of `make_report`, made when it is read: most steps of a loop are not."""
     names = tuple([_NAMES[status] for status in diagnostics["status"]])
     make = partial(make_report, diagnostics, surfaces, batched=batched)
-    return Report.later(names if batched else names[0], make)
+    return report_later(names if batched else names[0], make)
 
 
 def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
