@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from inspect import signature
@@ -83,14 +83,19 @@ class CoreFunction(ABC):
     Attributes:
         owner: Name of the function in messages.
         names: Names of its differentiable inputs.
+        constants: Arrays of all other inputs; the methods receive them among their inputs.
         tape: Further data for its derivatives, kept by the graph.
     """
 
     owner: str
 
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self.names = names
+    def __init__(self, names: tuple[str, ...], constants: Arrays | None = None) -> None:
+        self.names, self.constants = names, {} if constants is None else constants
         self.tape: dict[str, Tensor] = {}
+
+    def inputs(self, arrays: Iterable[NDArray[np.float64]]) -> Arrays:
+        """Return all inputs by name, from arrays of the differentiable ones."""
+        return self.constants | dict(zip(self.names, arrays, strict=True))
 
     @abstractmethod
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
@@ -118,7 +123,7 @@ def evaluate(function: CoreFunction, inputs: Sequence[Tensor]) -> tuple[Tensor, 
 class _Evaluate(torch.autograd.Function):
     @staticmethod
     def forward(function, *tensors):
-        return function.values(dict(zip(function.names, map(as_array, tensors), strict=True)))
+        return function.values(function.inputs(map(as_array, tensors)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -193,5 +198,5 @@ def _gradients(ctx, needs, saved, losses):
 
 def _arrays(ctx, saved):
     arrays = dict(zip(ctx.saved_names, map(as_array, saved), strict=True))
-    inputs = {name: arrays.pop(name) for name in ctx.function.names}
+    inputs = ctx.function.inputs([arrays.pop(name) for name in ctx.function.names])
     return inputs, arrays

@@ -43,25 +43,6 @@ from diffcloth_torch.model.quantities import Fields
 
 __all__ = ["Dynamics", "Prediction"]
 
-# Fields of parameters that bodies and robots have.
-_FIELDS = (
-    "gravity",
-    "body_mass",
-    "body_center",
-    "body_inertia",
-    "link_mass",
-    "link_center",
-    "link_inertia",
-    "joint_armature",
-    "joint_stiffness",
-    "joint_damping",
-    "joint_viscosity",
-    "joint_effort_limits",
-    "joint_velocity_limits",
-    "joint_friction",
-    "joint_slip_rates",
-)
-
 _forked = False
 
 
@@ -149,13 +130,13 @@ class _Kept(NamedTuple):
     """Parameters of the scene, which are prepared once.
 
     Attributes:
-        fields: The fields of parameters; None for a field that the scene lacks.
+        fields: All fields of the parameters.
         parameters: The same for bodies and robots.
         of_bodies: Constants of the core's functions of bodies.
         of_robots: For each robot the constants of its functions.
     """
 
-    fields: dict[str, Tensor | None]
+    fields: Fields
     parameters: _Parameters
     of_bodies: Mapping[str, Constant]
     of_robots: list[Mapping[str, Constant]]
@@ -234,7 +215,7 @@ class Dynamics:
             for robot, parts in zip(self._robots, own.robots, strict=True)
         ]
         self._kept = _Kept(
-            fields={name: parameters.get(name) for name in _FIELDS},
+            fields=dict(parameters),
             parameters=own,
             of_bodies=_constants(of_bodies),
             of_robots=[_constants(named) for named in of_robots],

@@ -111,28 +111,26 @@ class _Operation(CoreFunction):
     def __init__(
         self, function: _core.SmoothFunction, constants: Arrays, names: tuple[str, ...]
     ) -> None:
-        super().__init__(names)
-        self._function, self._constants = function, constants
+        super().__init__(names, constants)
+        self._function = function
         self.outputs: tuple[str, ...] = ()
 
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
-        every = self._constants | inputs
-        values = self._function.values(every, _threads(every.values()))
+        values = self._function.values(inputs, _threads(inputs.values()))
         self.outputs = tuple(values)
         return tuple(torch.from_numpy(array) for array in values.values())
 
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
-        every = self._constants | inputs
-        tangents = self._function.tangents(every, given, count, _threads(every.values()))
+        threads = _threads(inputs.values())
+        tangents = self._function.tangents(inputs, given, count, threads)
         return [torch.from_numpy(tangents[name]) for name in self.outputs]
 
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
     ) -> list[Tensor]:
         given = dict(zip(self.outputs, map(as_array, cotangents), strict=True))
-        every, losses = self._constants | inputs, len(cotangents[0])
-        threads = _threads(every.values())
-        gradients = self._function.gradients(every, given, losses, needs, threads)
+        losses, threads = len(cotangents[0]), _threads(inputs.values())
+        gradients = self._function.gradients(inputs, given, losses, needs, threads)
         return [
             torch.from_numpy(gradients[name]).reshape(losses, *inputs[name].shape) for name in needs
         ]

@@ -38,25 +38,25 @@ class _StoredEnergy(CoreFunction):
     owner = "energy"
 
     def __init__(self, core: _core.Simulator, others: Arrays, names: tuple[str, ...]) -> None:
-        super().__init__(names)
-        self.core, self.others = core, others
+        super().__init__(names, others)
+        self.core = core
         self.parts: tuple[str, ...] = ()
 
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
-        energies = self.core.stored_energy(self.others | inputs)
+        energies = self.core.stored_energy(inputs)
         self.parts = tuple(energies)
         return tuple(map(torch.from_numpy, energies.values()))
 
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
         threads = torch.get_num_threads()
-        tangents = self.core.energy_tangent(self.others | inputs, given, count, threads)
+        tangents = self.core.energy_tangent(inputs, given, count, threads)
         return [torch.from_numpy(tangents[part]) for part in self.parts]
 
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
     ) -> list[Tensor]:
         gradients = self.core.energy_backward(
-            self.others | inputs,
+            inputs,
             dict(zip(self.parts, map(as_array, cotangents), strict=True)),
             len(cotangents[0]),
             needs,

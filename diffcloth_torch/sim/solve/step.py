@@ -161,13 +161,13 @@ class _Step(CoreFunction):
     owner = "step"
 
     def __init__(self, core: _core.Simulator, constants: Arrays, names: tuple[str, ...]) -> None:
-        super().__init__(names)
-        self.core, self.constants = core, constants
+        super().__init__(names, constants)
+        self.core = core
         self.diagnostics: dict[str, Any] = {}
         self.kept: Any = None
 
     def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
-        result = _forward(self.core, self.constants | inputs, tape=True)
+        result = _forward(self.core, inputs, tape=True)
         self.tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
         self.kept = result[_KEPT]
         self.diagnostics = diagnostics_of(result)
@@ -183,16 +183,14 @@ class _Step(CoreFunction):
                 environments=changed,
             )
         threads = torch.get_num_threads()
-        tangents = self.core.tangent(
-            self.constants | inputs, tape, self.kept, given, count, threads
-        )
+        tangents = self.core.tangent(inputs, tape, self.kept, given, count, threads)
         return [torch.from_numpy(tangents[name]) for name in _OUTPUTS if name in tangents]
 
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
     ) -> list[Tensor]:
         gradients = self.core.backward(
-            self.constants | inputs,
+            inputs,
             tape,
             self.kept,
             dict(zip(_OUTPUTS, map(as_array, cotangents), strict=False)),
