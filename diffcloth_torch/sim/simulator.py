@@ -41,7 +41,7 @@ from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.trajectory import Trajectory
 from diffcloth_torch.sim.rollout import Controls, StepParameters, roll_out
 from diffcloth_torch.sim.solve.engine import Engine
-from diffcloth_torch.sim.solve.outcome import later_report, make_report
+from diffcloth_torch.sim.solve.outcome import lazy_report, make_report
 from diffcloth_torch.sim.start import (
     StartWatch,
     check_gains,
@@ -436,7 +436,7 @@ class Simulator(Observables):
         return State(
             **without_axes(fields, batch),
             time=state.time + self.dt,
-            report=later_report(diagnostics, self.surfaces, batched=batch is not None),
+            report=lazy_report(diagnostics, self.surfaces, batched=batch is not None),
             _surfaces=self._engine.surfaces,
         )
 

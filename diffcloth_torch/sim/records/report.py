@@ -19,7 +19,7 @@ from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.contacts import Contacts
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 
-__all__ = ["Report", "combine_reports", "outcome_text", "report_later"]
+__all__ = ["Report", "combine_reports", "outcome_text", "unmade_report"]
 
 
 def _nothing() -> None:
@@ -131,7 +131,7 @@ class Report(_WithFields):
         def __dict__(self) -> dict[str, Any]:
             own = _fields_of(self)
             make = own.get("_make")
-            if make is not None:  # see `report_later`
+            if make is not None:  # see `unmade_report`
                 own.update(vars(make()))
                 own.pop("_make", None)
             return own
@@ -195,7 +195,7 @@ class Report(_WithFields):
         return combine_reports(Choice(mask, batched), [a, b])
 
 
-def report_later(status: str | tuple[str, ...], make: Callable[[], Report]) -> Report:
+def unmade_report(status: str | tuple[str, ...], make: Callable[[], Report]) -> Report:
     """Return a report that is made when another field than its status is first read.
 
     Args:

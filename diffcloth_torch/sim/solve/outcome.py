@@ -19,7 +19,7 @@ from diffcloth_torch.errors import (
 )
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.contacts import Contacts
-from diffcloth_torch.sim.records.report import Report, report_later
+from diffcloth_torch.sim.records.report import Report, unmade_report
 from diffcloth_torch.sim.solve.step import (
     CONVERGED,
     CRITERIA,
@@ -30,7 +30,7 @@ from diffcloth_torch.sim.solve.step import (
     UNCONVERGED,
 )
 
-__all__ = ["later_report", "make_report", "raise_on_failure"]
+__all__ = ["lazy_report", "make_report", "raise_on_failure"]
 
 
 def _named(prefix: str) -> dict[str, str]:
@@ -58,11 +58,11 @@ _ROWS: dict[type, tuple[str, ...]] = {
 _REPORTED = tuple(name for names in _ROWS.values() for name in names)
 
 
-def later_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
+def lazy_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
     """Return the report of `make_report`, made when it is read: most steps of a loop are not."""
     names = tuple([_NAMES[status] for status in diagnostics["status"]])
     make = partial(make_report, diagnostics, surfaces, batched=batched)
-    return report_later(names if batched else names[0], make)
+    return unmade_report(names if batched else names[0], make)
 
 
 def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
