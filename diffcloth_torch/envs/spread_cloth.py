@@ -60,7 +60,7 @@ class SpreadCloth(SheetTask):
 
     name = "SpreadCloth"
     steps = 45
-    directions: ClassVar[int] = 2  # of the pleats: across x alone, or also across y
+    directions: ClassVar[int] = 2  # 1: pleats lie across x; 2: across x or across y
     steepness: ClassVar[tuple[float, float]] = (1.2, 1.5)  # overhangs would bury the edges [rad]
     beside: ClassVar[float] = 0.04
     above: ClassVar[tuple[float, float]] = (0.02, 0.05)
@@ -75,6 +75,7 @@ class SpreadCloth(SheetTask):
         pleats = {
             "steepness": uniform(generator, 1, *self.steepness)[0],
             "phase": uniform(generator, 1, 0.0, 2 * math.pi)[0],
+            "across": cpu.zeros((), dtype=torch.int64),
         }
         if self.directions > 1:
             pleats["across"] = cpu.randint(self.directions, (1,), generator=generator)[0]
@@ -95,8 +96,6 @@ class SpreadCloth(SheetTask):
         z = z - z.amin(dim=-1, keepdim=True) + HEIGHT
         flat = self.flat(len(x))
         across_x = torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
-        if "across" not in drawn:
-            return across_x
         # Rows of vertices lie along x: the transposed sheet has its pleats across y.
         across_y = across_x.reshape(-1, n, n, 3).transpose(1, 2).reshape(-1, n * n, 3)
         across_y = across_y[..., [1, 0, 2]]
@@ -142,8 +141,7 @@ class SpreadCloth(SheetTask):
     def along(self, env: EnvState) -> Tensor:
         """The direction across the pleats, [B, 1, 3]."""
         turn = env.drawn["turn"]
-        if "across" in env.drawn:
-            turn = turn + 0.5 * math.pi * env.drawn["across"]
+        turn = turn + 0.5 * math.pi * env.drawn["across"].to(turn.dtype)
         return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=-1)[:, None]
 
     def scripted(self, env: EnvState) -> Tensor:

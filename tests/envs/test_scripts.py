@@ -55,6 +55,36 @@ def test_the_script_of_a_drop_moves_level_until_the_edge_is_over_its_goal(elapse
     assert bool((grasp == 1).all())
 
 
+def test_pleats_lie_across_the_way_of_the_pickers():
+    """For both directions: lengths along the pleats are kept, and pickers begin at their edges."""
+    task, state = begun("SpreadCloth", 2)
+    drawn = {name: state.drawn[name] for name in ("turn", "steepness", "phase", "shift")}
+    drawn = {name: value[:1].repeat(2, *[1] * (value.dim() - 1)) for name, value in drawn.items()}
+    drawn["across"] = torch.tensor([0, 1])
+    sheet = task.posed(task.shape(drawn), drawn).reshape(2, SMALL, SMALL, 3)
+    along = task.along(replace(state, drawn=drawn))[:, 0]
+    assert float((along[0] * along[1]).sum()) == pytest.approx(0, abs=1e-12)
+    for row, axis in enumerate((1, 0)):  # of the vertices along x in the first axis
+        pleated = sheet[row].movedim(axis, 0)
+        widths = lengths(pleated[1:] - pleated[:-1])
+        kept = lengths(pleated[:, 1:] - pleated[:, :-1])
+        torch.testing.assert_close(kept, torch.full_like(kept, 0.1))
+        assert float(widths.max()) < 0.1
+        picked = sheet[row].reshape(-1, 3)[task.picked(drawn)[row]]
+        way = picked[1] - picked[0]
+        assert float(way @ along[row]) == pytest.approx(float(lengths(way[:2])))
+
+
+def test_the_script_of_a_fling_follows_corners_until_its_pickers_are_closed():
+    task, state = begun("FlingCloth", 2)
+    moved = state.state.positions + torch.tensor([0.01, 0.0, 0.0], dtype=torch.float64)
+    there = replace(state, state=state.state.replace(positions=moved))
+    for elapsed, follows in ((3, True), (8, True), (9, False), (20, False)):
+        late = torch.full((2,), elapsed)
+        plain, shifted = (task.scripted(replace(s, elapsed=late)) for s in (state, there))
+        assert torch.equal(plain, shifted) != follows
+
+
 def test_pegs_lie_across_the_way_of_the_hand():
     task, state = begun("HangCloth", 1)
     scene = task.simulator.scene
