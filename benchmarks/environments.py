@@ -14,8 +14,8 @@ from typing import Any
 import click
 import torch
 
+from benchmarks.pages import around, share
 from diffcloth_torch import envs
-from diffcloth_torch.learn.evaluation import wilson
 from diffcloth_torch.sim.solve import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
@@ -157,9 +157,7 @@ def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | N
         env = envs.make(name, episodes, size=size, autoreset_mode="Disabled")
         for policy in POLICIES:
             total, success = _episodes(env, policy)
-            low, high = wilson(success, episodes)
-            shares = f"{success / episodes:.0%} ({low:.0%} to {high:.0%})"
-            cells.append(f"{total:.1f}, {shares.replace('%', ' %')}")
+            cells.append(f"{total:.1f}, {share(success, episodes)}")
         row = f"| `{name}` | " + " | ".join(cells) + " |"
         print(row)
         sys.stdout.flush()
@@ -170,10 +168,7 @@ def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | N
 def with_row(text: str, row: str) -> str:
     """The text of a page with the row of a task in its table of returns."""
     begin, end = _MARKS
-    before, _, rest = text.partition(begin)
-    table, _, after = rest.partition(end)
-    if not after:
-        raise ValueError(f"the page must have a table between {begin!r} and {end!r}")
+    before, table, after = around(text, begin, end)
     task = row.split("|")[1]
     rows = table.rstrip("\n").split("\n")
     places = [k for k, each in enumerate(rows) if each.split("|")[1:2] == [task]]

@@ -44,6 +44,7 @@ from benchmarks import forward_peers, scripted
 from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
 from benchmarks.integrators import INTEGRATORS, errors_and_times
 from benchmarks.measure import time_steps
+from benchmarks.pages import table
 from benchmarks.peers import time_all
 from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime, kept_file
 from benchmarks.step import _processor
@@ -207,48 +208,35 @@ def measure(others: dict[str, Path], cpu: bool, quick: bool, kept: Path) -> Reco
     return records
 
 
+def _dated(rows: Iterable[Any], **more: Any) -> Records:
+    """Measured rows with the date and the processor."""
+    found = list(rows)
+    return {"date": date.today().isoformat(), "processor": _processor(), **more, "rows": found}
+
+
 def measure_peers(newton: Path, quick: bool) -> Records:
     """Return the times that `benchmarks.peers` measures, with date and processor."""
     torch.set_num_threads(1)
-    return {
-        "date": date.today().isoformat(),
-        "processor": _processor(),
-        "rows": list(time_all(newton, 6 if quick else PHASE_SIZES[0])),
-    }
+    return _dated(time_all(newton, 6 if quick else PHASE_SIZES[0]))
 
 
 def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
     """Measurements of `benchmarks.forward_peers`, with date and processor."""
     torch.set_num_threads(1)
-    return {
-        "date": date.today().isoformat(),
-        "processor": _processor(),
-        "rows": list(forward_peers.time_all(newton, mujoco, PHASE_SIZES[0])),
-    }
+    return _dated(forward_peers.time_all(newton, mujoco, PHASE_SIZES[0]))
 
 
 def measure_environments(release: str, folder: Path, quick: bool) -> Records:
     """Return the times that `benchmarks.scripted` measures, with the date."""
     rows, steps, turns = ((("FoldCloth", 7, 1),), 2, 1) if quick else (scripted.ROWS, 40, 3)
-    return {
-        "date": date.today().isoformat(),
-        "processor": _processor(),
-        "release": release,
-        "rows": [
-            scripted.time_row(row, folder, steps, turns)
-            for row in tqdm(rows, desc="environments", disable=None, leave=False)
-        ],
-    }
+    shown = tqdm(rows, desc="environments", disable=None, leave=False)
+    return _dated((scripted.time_row(row, folder, steps, turns) for row in shown), release=release)
 
 
 def measure_integrators(quick: bool) -> Records:
     """Return the errors and times of both integrators, with the date."""
     torch.set_num_threads(1)
-    return {
-        "date": date.today().isoformat(),
-        "processor": _processor(),
-        "rows": errors_and_times(4, 0.1) if quick else errors_and_times(5, 0.5),
-    }
+    return _dated(errors_and_times(4, 0.1) if quick else errors_and_times(5, 0.5))
 
 
 def _phases(name: str, size: int, steps: int, kept: Path) -> Records:
@@ -468,7 +456,7 @@ def _integrator_table(rows: list[Records]) -> str:
             line += [_number(row[name]["error"]), _number(row[name]["milliseconds"])]
         ratio = row["second_order"]["milliseconds"] / row["implicit_euler"]["milliseconds"]
         lines.append([*line, _number(ratio)])
-    return _table([*head, "times, ratio"], lines)
+    return table([*head, "times, ratio"], lines)
 
 
 def _preface(records: Records) -> str:
@@ -522,7 +510,7 @@ def _release_table(rows: list[Records]) -> str:
         line += [f"{r[side]['iterations']:.1f}" for side in ("this", "other")]
         line += [r[side]["unconverged"] for side in ("this", "other")]
         lines.append(line)
-    return _table(head, lines)
+    return table(head, lines)
 
 
 def _environment_text(found: Records) -> str:
@@ -546,14 +534,14 @@ def _environment_table(rows: list[Records]) -> str:
             line += [_number(r[side][part]) for side in ("this", "other")]
             line.append(_number(_ratio(r, part)))
         lines.append([*line, *(f"{r[side]['iterations']:.1f}" for side in ("this", "other"))])
-    return _table([*head, "iterations", "other"], lines)
+    return table([*head, "iterations", "other"], lines)
 
 
 def _environment_phases(rows: list[Records]) -> str:
     """Phases of forward [ms] and counts a step, of this release."""
     phases = list(rows[0]["this"]["phases"])
     counts = ["exact", "chord", "projected", "factorizations"]
-    return _table(
+    return table(
         ["task", "size", "batch", *phases, "contacts", *counts],
         [
             [r["task"], r["size"], r["batch"]]
@@ -573,7 +561,7 @@ contact-free Hessian of the same state. Times in EF vary less from machine to ma
 
 def _phase_table(rows: list[Records]) -> str:
     phases = list(rows[0]["phases"])
-    return _table(
+    return table(
         ["scene", "size", "forward [EF]", "backward [EF]", "iterations", "contacts", *phases],
         [
             [r["scene"], r["size"], f"{r['forward_in_ef']:.2f}", f"{r['backward_in_ef']:.2f}"]
@@ -607,7 +595,7 @@ def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) ->
         one, other = (r[key] for key in pair)
         times = [_number(value) for value in (one, other, one / other)]
         lines.append([*(r[label] for label in labels), *times])
-    return _table([*labels, *pair.values(), "ratio"], lines)
+    return table([*labels, *pair.values(), "ratio"], lines)
 
 
 _PEER_TEXT = """\
@@ -628,7 +616,7 @@ def _peer_table(rows: list[Records]) -> str:
         line = [r["scene"], r["size"], r["by"], r["substeps"]]
         line += [_number(r["forward"]), _number(r["backward"])]
         lines.append([*line, f"{r['gradient_error']:.1e}", f"{r['depth']:.2g}"])
-    return _table([*head, "depth [mm]"], lines)
+    return table([*head, "depth [mm]"], lines)
 
 
 def _forward_peer_text(found: Records) -> str:
@@ -648,12 +636,7 @@ def _forward_peer_table(rows: list[Records]) -> str:
         line = [r["scene"], r["size"], r["by"], r["substeps"], _number(r["forward"])]
         line += [r["crossings"], r["inside"]]
         lines.append([*line, f"{r['depth']:.2g}", f"{r['stretch']:.2f}"])
-    return _table([*head, "depth [mm]", "stretch"], lines)
-
-
-def _table(head: list[str], rows: list[list[Any]]) -> str:
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    return table([*head, "depth [mm]", "stretch"], lines)
 
 
 def _is(row: Records, size: int) -> bool:

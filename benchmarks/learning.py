@@ -23,8 +23,7 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from benchmarks.environments import roll_out
 from benchmarks.learning_methods import FROM_REWARDS, METHODS, UNLEARNED, Job, learned
 from benchmarks.learning_tables import listing, with_tables
 from diffcloth_torch import envs
+from diffcloth_torch.envs.env import steps_made
 from diffcloth_torch.learn import Plans
 from diffcloth_torch.learn.evaluation import wilson
 
@@ -166,15 +166,15 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 def measured(job: Job, episodes: int) -> dict[str, Any]:
     """The row of a job."""
-    with _counted() as spent:
-        found = learned(job)
+    steps, seconds = steps_made(), time.process_time()
+    found = learned(job)
+    steps, seconds = steps_made() - steps, time.process_time() - seconds
     if isinstance(found, Plans):
         returns, success = found.returns, found.success
     else:
         env = job.make(num_envs=episodes, autoreset_mode="Disabled")
         with torch.no_grad():
             returns, success, _ = roll_out(env, found(env), _FRESH + job.seed)
-    steps, seconds = spent
     count, done = len(success), int(success.sum())
     return {
         **dict(zip(("task", "size", "method", "seed", "budget"), job.key, strict=True)),
@@ -196,25 +196,6 @@ def _revision() -> str:
     return subprocess.run(
         command, cwd=here, capture_output=True, text=True, check=True
     ).stdout.strip()
-
-
-@contextmanager
-def _counted() -> Iterator[list[Any]]:
-    """Environment steps and processor seconds of a block; known after it."""
-    counts: list[Any] = []
-    transition, steps, begin = envs.Task.transition, 0, time.process_time()
-
-    def counting(task: envs.Task, env: envs.EnvState, *given: Any) -> envs.EnvState:
-        nonlocal steps
-        steps += len(env)
-        return transition(task, env, *given)
-
-    envs.Task.transition = counting  # type: ignore[method-assign]
-    try:
-        yield counts
-    finally:
-        envs.Task.transition = transition  # type: ignore[method-assign]
-        counts += [steps, time.process_time() - begin]
 
 
 if __name__ == "__main__":

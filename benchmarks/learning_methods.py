@@ -133,15 +133,15 @@ def _imitated(job: Job) -> Acts:
 
 
 def stage_of(task: str) -> dict[str, int]:
-    """Rounds, episodes and iterations of the imitation in the configuration of a task."""
+    """Rounds, episodes and iterations of the imitation of the script, by the configuration."""
     for path in sorted(_CONFIGS.glob("train_*.yaml")):
         document = read_document(path)
         if document["environment"]["name"] != task:
             continue
         for stage in document.get("stages", []):
-            if stage["kind"] == "imitate":
+            if (stage["kind"], stage.get("teacher")) == ("imitate", "scripted"):
                 return {n: v for n, v in stage.items() if n not in ("kind", "teacher")}
-    raise ValueError(f"{_CONFIGS} must have a file of {task} with a stage of the kind imitate")
+    raise ValueError(f"{_CONFIGS} must have a file of {task} with a stage that imitates the script")
 
 
 def _transferred(job: Job) -> Acts:

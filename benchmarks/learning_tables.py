@@ -8,11 +8,11 @@ from statistics import fmean
 from typing import Any
 
 from benchmarks.learning_methods import FROM_REWARDS, METHODS
-from diffcloth_torch.learn.evaluation import wilson
+from benchmarks.pages import around, share, table
 
 MARKS = "<!-- methods -->\n", "<!-- end of methods -->\n"  # around the tables on a page
 Rows = Sequence[Mapping[str, Any]]
-# Of the first table: the columns of each method, with attributes of `Pooled`.
+# Columns of the first table by method: title, and attribute of `Pooled`.
 _COLUMNS = {
     "replay": [("replay", "share")],
     "script": [("script", "share"), ("its return", "mean")],
@@ -49,9 +49,8 @@ def pooled(rows: Rows) -> Pooled:
     """Pool rows that differ in their seeds."""
     count = sum(row["episodes"] for row in rows)
     done = sum(round(row["success"] * row["episodes"]) for row in rows)
-    low, high = wilson(done, count)
     return Pooled(
-        f"{done / count:.0%} ({low:.0%} to {high:.0%})".replace("%", " %"),
+        share(done, count),
         len(rows),
         f"{fmean(row['return'] for row in rows):.1f}",
         f"{fmean(row['steps'] for row in rows):.0f}",
@@ -62,7 +61,7 @@ def pooled(rows: Rows) -> Pooled:
 def tables(rows: Rows) -> str:
     """Two tables: imitation beside its teacher and at other sizes, and learning from rewards."""
     tasks = sorted({row["task"] for row in rows})
-    return f"{_imitation(rows, tasks)}\n{_from_rewards(rows, tasks)}"
+    return f"{_imitation(rows, tasks)}\n\n{_from_rewards(rows, tasks)}\n"
 
 
 def _imitation(rows: Rows, tasks: Iterable[str]) -> str:
@@ -76,7 +75,7 @@ def _imitation(rows: Rows, tasks: Iterable[str]) -> str:
         for size in sizes:
             line += _cells([r for r in _of(rows, task, "transfer") if r["size"] == size], ["share"])
         lines.append(line)
-    return _markdown([*head, *(f"{size} x {size}" for size in sizes)], lines)
+    return table([*head, *(f"{size} x {size}" for size in sizes)], lines)
 
 
 def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
@@ -89,7 +88,7 @@ def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
                 same = [row for row in mine if row["budget"] == budget]
                 lines.append([f"`{task}`", method.upper(), *_cells(same, names)])
     head = ["task", "method", "seeds", "success", "return", "steps", "minutes"]
-    return _markdown(head, lines)
+    return table(head, lines)
 
 
 def _of(rows: Rows, task: str, method: str) -> Rows:
@@ -102,18 +101,10 @@ def _cells(rows: Rows, names: Sequence[str]) -> list[str]:
     return [str(getattr(found, name)) if found else "" for name in names]
 
 
-def _markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    cells = [head, ["---"] * len(head), *lines]
-    return "".join("| " + " | ".join(line) + " |\n" for line in cells)
-
-
 def with_tables(text: str, rows: Rows) -> str:
     """The text of a page with the tables between the lines `MARKS`."""
     begin, end = MARKS
-    before, found, rest = text.partition(begin)
-    _, ended, after = rest.partition(end)
-    if not (found and ended):
-        raise ValueError(f"the page must have lines {begin!r} and {end!r}")
+    before, _, after = around(text, begin, end)
     return "".join([before, begin, tables(rows), end, after])
 
 
@@ -128,4 +119,4 @@ def listing(rows: Rows) -> str:
         ]
         for row in sorted(rows, key=lambda r: (r["task"], METHODS.index(r["method"]), r["seed"]))
     ]
-    return _markdown(head, lines)
+    return table(head, lines)
