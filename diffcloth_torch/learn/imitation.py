@@ -134,11 +134,12 @@ def fit(
         shown: Actions.
         iterations: Number of steps of Adam.
         draws: Generator that draws the batches.
-        decay: Weight decay of AdamW; it does not apply to knots, which are actions.
+        decay: Weight decay of AdamW; it does not apply to knots, which are actions, nor to the
+            logarithm of the deviation of the noise, on which the loss does not depend.
     """
     groups: dict[bool, list[torch.nn.Parameter]] = {True: [], False: []}
     for name, parameter in policy.actor.named_parameters():
-        groups[name.endswith("knots")].append(parameter)
+        groups[name.endswith(("knots", "log_deviation"))].append(parameter)
     adam = torch.optim.AdamW(
         [
             {"params": parameters, "weight_decay": 0.0 if fixed else decay}

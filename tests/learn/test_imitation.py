@@ -110,7 +110,8 @@ def test_a_policy_learns_from_plans_with_the_same_bits():
     assert all(torch.equal(value, policies[1][name]) for name, value in policies[0].items())
 
 
-def test_weight_decay_shrinks_all_weights_except_knots():
+def test_weight_decay_shrinks_all_weights_except_knots_and_deviations():
+    """A trainer that begins at the policy has the noise of the options."""
     env = SOFT(num_envs=2)
     options = TrainerOptions("apg", plan_knots=3, hidden=(8,), first_action=(0.5,) * 8)
     seen, shown = torch.zeros(4, Policy(env, options).observations), torch.full((4, 8), 0.5)
@@ -125,6 +126,8 @@ def test_weight_decay_shrinks_all_weights_except_knots():
     sizes = [float(actor.layers[0].weight.detach().norm()) for actor in (kept, shrunk)]
     assert sizes[1] < 0.5 * sizes[0]
     torch.testing.assert_close(shrunk.plan.knots, kept.plan.knots, atol=0.1, rtol=0)
+    deviations = shrunk.log_deviation.detach().exp()
+    torch.testing.assert_close(deviations, torch.full((8,), options.init_std))
 
 
 def test_plans_are_imitated_with_weight_decay(monkeypatch):
