@@ -21,7 +21,10 @@ _LARGEST_COUNT = 10**6  # of steps, epochs, batches, critics, starts, updates
 _LARGEST = 1e6  # above every sensible value
 _POSITIVE = (
     "learning_rate", "plan_learning_rate", "critic_learning_rate", "temperature_learning_rate",
-    "max_grad_norm", "init_std", "temperature",
+    "max_grad_norm", "max_move", "init_std", "temperature",
+)  # fmt: skip
+_COUNTS = (
+    "horizon", "critic_epochs", "critic_batches", "critics", "check_every", "fit_iterations",
 )  # fmt: skip
 
 
@@ -88,6 +91,21 @@ class TrainerOptions(_RefusesOldNames):
             network alone.
         plan_learning_rate: Learning rate of Adam for the plan; the linear function has the learning
             rate of the policy.
+        action_step: Root mean square change of actions at which an update aims. The gradient of
+            each environment with respect to its actions is divided by its own norm and moves the
+            actions of the rollout by this step, and the policy is fitted to the moved actions by
+            `fit_iterations` steps of Adam, while its actions are retained at observations of the
+            ten rollouts before. Rewards of the last `Task.holds` steps of an episode without
+            success count four times. The step falls with `decay_updates`; `max_grad_norm` has no
+            effect. Not with "sapo", whose loss depends on more than actions, nor with `feedback`.
+            None: a step of Adam along the gradient of the weights.
+        max_move: Largest change of a number of an action at which an update with `action_step`
+            aims. Where the gradient concentrates on few numbers, such as the effort of fingers, a
+            large move crosses cliffs of the return.
+        fit_iterations: Steps of Adam in an update with `action_step`.
+        draws: Number of plans near `first_action` of which the training begins at the best, by the
+            mean reward of a rollout without noise: the first action itself, and random plans. It
+            needs `plan_knots`. 0: the first action.
         hidden: Sizes of hidden layers.
         max_change: Largest change of actions by an update: root mean square, without noise, over
             the observations of the rollout. A larger update is scaled back. The scale of
@@ -127,6 +145,10 @@ class TrainerOptions(_RefusesOldNames):
     first_action: tuple[float, ...] | None = None
     plan_knots: int = 0
     plan_learning_rate: float = 4e-2
+    action_step: float | None = None
+    max_move: float = 0.3
+    fit_iterations: int = 20
+    draws: int = 0
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
     max_change: float | None = None
@@ -140,8 +162,9 @@ class TrainerOptions(_RefusesOldNames):
         check_choice("TrainerOptions: `scale`", self.scale, SCALES)
         if not isinstance(self.feedback, bool):
             raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
-        for name in ("horizon", "critic_epochs", "critic_batches", "critics", "check_every"):
+        for name in _COUNTS:
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1, _LARGEST_COUNT)
+        check_count("TrainerOptions: `draws`", self.draws, 0, _LARGEST_COUNT)
         for name in ("critic_only", "decay_updates", "plan_knots", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "gae_lambda", "tau"):
@@ -151,6 +174,18 @@ class TrainerOptions(_RefusesOldNames):
             _check_number(name, getattr(self, name), lambda v: 0 < v < _LARGEST, accepted)
         if self.max_change is not None:
             _check_number("max_change", self.max_change, lambda v: 0 < v < _LARGEST, accepted)
+        if self.action_step is not None:
+            name, value = "action_step", self.action_step
+            _check_number(name, value, lambda v: 0 < v <= 1, "in (0, 1]")
+            if self.feedback or self.has_entropy:
+                raise InvalidInput(
+                    "TrainerOptions: `action_step` must be None with `feedback` and with the "
+                    f'algorithm "sapo", got {value!r}'
+                )
+        if self.draws and not self.plan_knots:
+            raise InvalidInput(
+                f"TrainerOptions: `draws` must be 0 without `plan_knots`, got {self.draws}"
+            )
         if self.held_out is not None:
             check_count("TrainerOptions: `held_out`", self.held_out, 0, _LARGEST_COUNT)
         _check_number("target_entropy", self.target_entropy, math.isfinite, "finite")

@@ -29,7 +29,7 @@ from diffcloth_torch.envs.env import EnvState, add_steps, steps_made
 from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
-from diffcloth_torch.learn.rollouts import MakeEnv, threads_of_torch
+from diffcloth_torch.learn.rollouts import LAST_WEIGHT, MakeEnv, threads_of_torch
 from diffcloth_torch.learn.starts import LARGEST_SEED, part_seeds
 from diffcloth_torch.learn.workers import Workers, check_workers, pickled
 from diffcloth_torch.memory import check_memory
@@ -41,7 +41,6 @@ _CHECKPOINT = "plans"  # kind of the files of `Plans.save`
 _TOGETHER, _REPLAYED = 2, 8  # plans of a piece of improvements, and of replays
 _BETAS = (0.9, 0.95)  # decay rates of Adam
 _RATE, _LAST_SHARE = 0.1, 0.1  # initial learning rate of Adam, and its final share
-_LAST_WEIGHT = 3.0  # additional weight of the last rewards, in which success is read
 _NOISE = 0.2  # standard deviation of the noise of initial knots, common and of each
 _DRAWS = 16  # initial knots of an attempt, of which the best are improved
 _ROUNDS = 3  # largest number of repeated searches of starts without success
@@ -303,7 +302,7 @@ def improve(
         found = Improved(free.detach().clone(), actions, returns.detach(), success)
         best = found if best is None else best.better(found)
         if k < iterations and returns.requires_grad:
-            objective = returns + torch.where(best.success, 0.0, _LAST_WEIGHT * last)
+            objective = returns + torch.where(best.success, 0.0, LAST_WEIGHT * last)
             (slope,) = torch.autograd.grad(objective.sum(), leaf)
             (free.grad,) = torch.autograd.grad(before.tanh(), free, -_normalized(env, slope, k))
             adam.param_groups[0]["lr"] = rate * (1 - (1 - _LAST_SHARE) * k / max(iterations - 1, 1))

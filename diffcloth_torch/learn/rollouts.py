@@ -7,6 +7,7 @@ process. No autograd graph leaves the process that made it.
 from __future__ import annotations
 
 import pickle
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.policy import Policy
 
 __all__ = [
+    "LAST_WEIGHT",
     "MakeEnv",
     "Piece",
     "Rollout",
@@ -33,6 +35,9 @@ __all__ = [
 
 MakeEnv = Callable[..., ClothVectorEnv]
 """A function that makes environments, like `dc.envs.make`; called with the keyword `num_envs`."""
+
+LAST_WEIGHT = 3.0
+"""Additional weight of the last rewards of an episode, in which success is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +52,7 @@ class Piece:
         noise: Standard normal noise [h, n, A].
         share: Weight of each environment in the loss: one over their number in all pieces.
         threads: Number of threads of torch.
+        learns: True if the rollout is differentiated.
     """
 
     options: TrainerOptions
@@ -56,6 +62,7 @@ class Piece:
     noise: Tensor
     share: float
     threads: int = 1
+    learns: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +70,10 @@ class Rollout:
     """Result of a piece: h steps of n environments.
 
     Attributes:
-        gradients: Gradients of the loss, in the order of `Policy.actor.parameters()`.
+        gradients: Gradients of the loss, in the order of `Policy.actor.parameters()`; empty with
+            `action_step`.
+        slopes: With `action_step`, derivatives of the objective of each environment by its actions
+            [h, n, A], otherwise None.
         loss: Minus the objective: mean discounted rewards, with the entropy and value terms of the
             algorithm.
         seen: Observations before each step [h, n, O].
@@ -79,6 +89,7 @@ class Rollout:
     """
 
     gradients: list[Tensor]
+    slopes: Tensor | None
     loss: float
     seen: Tensor
     after: Tensor
@@ -94,21 +105,39 @@ class Rollout:
 
 def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     """Compute a rollout, and the gradient of its loss."""
+    with torch.set_grad_enabled(piece.learns):
+        return _rolled_out(env, piece)
+
+
+def _rolled_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     o = piece.options
     policy = Policy(env, o)
     policy.load_state_dict(piece.weights)
     observation = env.resume(piece.start, piece.generators)
     count, horizon = env.num_envs, len(piece.noise)
     temperature = policy.temperature
+    moves_actions = o.action_step is not None
     rows: list[dict[str, Tensor]] = []
+    leaves: list[Tensor] = []
+    last: deque[Tensor] = deque(maxlen=env.task.holds)  # discounted rewards
     discount, total = cpu.ones(count, dtype=torch.float32), cpu.zeros(count, dtype=torch.float32)
     for t, noise in enumerate(piece.noise):
         seen = observation.detach()
         actions, entropy = policy.act(observation if o.feedback else seen, noise)
+        if moves_actions:
+            actions = actions.detach().requires_grad_(piece.learns)
+            leaves.append(actions)
         observation, reward, terminated, truncated, info = env.step(actions)
         ended = terminated | truncated
         after = info["obs_before_reset"]
+        final = info.get("final_info", info)
         total = total + discount * (reward + temperature * entropy)
+        if moves_actions:
+            last.append(discount * reward)
+            missed = truncated & ~final["success"]
+            total = total + torch.where(missed, LAST_WEIGHT * torch.stack([*last]).sum(dim=0), 0.0)
+            if bool(ended.any()):  # rewards of an episode do not count in the next one
+                last = deque([torch.where(ended, 0.0, each) for each in last], maxlen=last.maxlen)
         discount = discount * o.discount
         if o.has_critic:
             # Value at the end of an episode or of the rollout; zero after a termination.
@@ -116,7 +145,6 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
             value = policy.targets(policy.scale(after)).mean(dim=0)
             total = total + torch.where(closes, discount * value, 0.0)
         discount = torch.where(ended, 1.0, discount)
-        final = info.get("final_info", info)
         rows.append(
             {
                 "seen": seen,
@@ -130,15 +158,29 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
             }
         )
     loss = -piece.share / horizon * total.sum()
-    gradients = torch.autograd.grad(loss, list(policy.actor.parameters()))
+    gradients: list[Tensor] = []
+    slopes = None
+    if piece.learns and moves_actions:
+        slopes = _slopes(total, leaves)
+    elif piece.learns:
+        gradients = list(torch.autograd.grad(loss, list(policy.actor.parameters())))
     env.clear_grad()
     return Rollout(
-        gradients=list(gradients),
+        gradients=gradients,
+        slopes=slopes,
         loss=float(loss.detach()),
         end=env.env_state,
         generators=env.generator_states(),
         **{name: torch.stack([row[name] for row in rows]) for name in rows[0]},
     )
+
+
+def _slopes(total: Tensor, leaves: list[Tensor]) -> Tensor:
+    """Return derivatives [h, n, A] of objectives [n] by actions; zero where they do not depend."""
+    if not total.requires_grad:
+        return torch.zeros_like(torch.stack(leaves))
+    found = torch.autograd.grad(total.sum(), leaves, materialize_grads=True)
+    return torch.stack(found)
 
 
 _made: dict[tuple[bytes, int], ClothVectorEnv] = {}  # in a worker's process

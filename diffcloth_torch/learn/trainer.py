@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -35,6 +36,7 @@ from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
+from diffcloth_torch.learn.action_steps import ROLLOUTS_KEPT, fit_moved_actions
 from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.evaluation import evaluate_starts, follow
 from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
@@ -54,6 +56,9 @@ from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Trainer", "record_of", "restore"]
+
+_SCALED = 10  # updates after which the scale of observations is fixed, with `action_step`
+_DRAWN = 0.2  # standard deviation of the noise of drawn plans, common and of each knot
 
 
 class Trainer:
@@ -159,6 +164,7 @@ class Trainer:
         starts = episode_seeds(purpose_seed(o.seed, "undo"), o.held_out or 0)
         self.held_out: tuple[int, ...] = tuple(starts)
         self._kept: Kept | None = None
+        self._former: list[Tensor] = []  # observations of the last rollouts [n, O]
         self._return = cpu.zeros(num_envs, dtype=torch.float32)
 
     @property
@@ -186,9 +192,11 @@ class Trainer:
             Values to log: "loss", "gradient_norm" before clipping, "reward" (mean of the rollout),
             "failed" (share of steps), "entropy" (of the policy, per number of an action),
             "critic_loss", "temperature" and, if episodes ended, their mean "return" and share of
-            "success". With `max_change` also "change", the change of actions by the update, and
-            "step_share", the applied share of the update; after a check "held_out", the share of
-            successes, and "undone", 1 if an earlier policy was restored.
+            "success". With `action_step`, "gradient_norm" is the mean norm of the gradients of the
+            environments by their actions. With `action_step` or `max_change` also "change", the
+            change of actions by the update, and with `max_change` "step_share", the applied share
+            of the update; after a check "held_out", the share of successes, and "undone", 1 if an
+            earlier policy was restored.
 
         Raises:
             SimulationError: If a gradient is not finite.
@@ -202,6 +210,8 @@ class Trainer:
         for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
             group["lr"] = share * rate
         self._critic_steps.param_groups[0]["lr"] = share * o.critic_learning_rate
+        if o.draws and not self.steps:
+            self._draw_plan()
         if self.held_out and self._kept is None:
             self.check()
         rollouts = self._rollouts()
@@ -209,8 +219,14 @@ class Trainer:
         log = {"loss": sum(r.loss for r in rollouts)}
         learns = not self.options.has_critic or self.updates >= self.options.critic_only
         seen = rows.seen.flatten(0, 1)
+        scales = o.max_change is None or not float(self.policy.scale.count)
+        if o.action_step is not None and scales and self.updates < _SCALED:
+            self.policy.scale.see(seen)
         region = None if o.max_change is None else TrustRegion(self.policy, seen, o.max_change)
-        log["gradient_norm"] = self._step_actor(rollouts, learns)
+        if o.action_step is None:
+            log["gradient_norm"] = self._step_actor(rollouts, learns)
+        else:
+            log |= self._move_actions(rollouts, rows.seen, learns, share * o.action_step)
         if region is not None:
             log["change"], log["step_share"] = region.limit()
         log["reward"] = float(rows.rewards.mean())
@@ -221,7 +237,7 @@ class Trainer:
         if self.options.has_entropy:
             log["temperature"] = self.policy.temperature
             self._step_temperature(log["entropy"])
-        if region is None or not float(self.policy.scale.count):
+        if o.action_step is None and scales:
             self.policy.scale.see(seen)
         self._places = [(r.end, r.generators) for r in rollouts]
         self.steps += rows.rewards.numel()
@@ -284,6 +300,7 @@ class Trainer:
             "counts": [self.steps, self.updates],
             "undone": self.undone,
             "kept": None if self._kept is None else copy.deepcopy(vars(self._kept)),
+            "former": [rows.clone() for rows in self._former],
             "return": self._return.clone(),
             "noise": self._noise.get_state(),
             "policy": {name: t.clone() for name, t in self.policy.state_dict().items()},
@@ -297,8 +314,8 @@ class Trainer:
     def _load(self, owner: str, given: Any) -> None:
         """Check a record completely, then restore its state."""
         own = self._record()
-        if isinstance(given, Mapping):  # files written before fine-tuning existed lack both
-            given = {"undone": 0, "kept": None} | dict(given)
+        if isinstance(given, Mapping):  # files written before fine-tuning existed lack these
+            given = {"undone": 0, "kept": None, "former": []} | dict(given)
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
         _require_task(owner, given["task"], own["task"])
@@ -313,11 +330,13 @@ class Trainer:
             places = self._checked_places(owner, given["places"])
         check_like(f"{owner}['counts']", given["counts"], own["counts"])
         steps, updates = given["counts"]
-        if steps != updates * self.options.horizon * self._count:
+        rollouts = updates + (self.options.draws if steps else 0)
+        if steps != rollouts * self.options.horizon * self._count:
             raise InvalidInput(
                 f"{owner}['counts'] must be {self.options.horizon * self._count} steps for each "
-                f"update, got {steps} steps and {updates} updates"
+                f"update and each draw, got {steps} steps and {updates} updates"
             )
+        self._check_former(f"{owner}['former']", given["former"], updates)
         check_like(f"{owner}['return']", given["return"], own["return"])
         check_generator(f"{owner}['noise']", given["noise"])
         check_like(f"{owner}['policy']", dict(given["policy"]), own["policy"])
@@ -337,9 +356,17 @@ class Trainer:
             optimizer.load_state_dict(kept)
         self.steps, self.updates = steps, updates
         self.undone, self._kept = given["undone"], copy.deepcopy(last_good)
+        self._former = [rows.clone() for rows in given["former"]]
         self._return = given["return"].clone()
         self._noise.set_state(given["noise"])
         self._places = places
+
+    def _check_former(self, owner: str, given: Any, updates: int) -> None:
+        """Require the observations of the last rollouts."""
+        count = 0 if self.options.action_step is None else min(updates, ROLLOUTS_KEPT)
+        rows = self.options.horizon * self._count
+        like = cpu.zeros(rows, self.policy.observations, dtype=torch.float32)
+        check_like(owner, given, [like] * count)
 
     def _checked_places(self, owner: str, given: Any) -> list[tuple[EnvState, list[Tensor]]]:
         sizes = [len(generators) for _, generators in given]
@@ -427,8 +454,9 @@ class Trainer:
         self._env.reset(seed=[int(word[0]) for word in words])
         return self._env.env_state, self._env.generator_states()
 
-    def _rollouts(self) -> list[Rollout]:
-        pieces = self._pieces()
+    def _rollouts(self, learns: bool = True) -> list[Rollout]:
+        """Compute rollouts of all chunks; without `learns`, also without noise and gradients."""
+        pieces = self._pieces(learns)
         if self._workers is None:
             return [roll_out(self._env, piece) for piece in pieces]
         if isinstance(self._workers, Ranks):
@@ -442,10 +470,14 @@ class Trainer:
             digest.update(tensor.contiguous().numpy().tobytes())
         return digest.digest()
 
-    def _pieces(self) -> list[Piece]:
+    def _pieces(self, learns: bool) -> list[Piece]:
         o = self.options
         sizes = (o.horizon, self._count, self.task.action_size)
-        noise = cpu.randn(*sizes, generator=self._noise, dtype=torch.float32)
+        noise = (
+            cpu.randn(*sizes, generator=self._noise, dtype=torch.float32)
+            if learns
+            else cpu.zeros(*sizes, dtype=torch.float32)
+        )
         # Copies: the weights of pieces must not change with an update.
         weights = {name: t.clone() for name, t in self.policy.state_dict().items()}
         return [
@@ -457,6 +489,7 @@ class Trainer:
                 noise[:, k : k + self._chunk],
                 1.0 / self._count,
                 self._threads,
+                learns,
             )
             for k, (start, generators) in zip(self._chunks, self._places, strict=True)
         ]
@@ -470,15 +503,68 @@ class Trainer:
             parameter.grad = gradient
         parameters = list(self.policy.actor.parameters())
         norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.max_grad_norm)
+        self._require_finite(norm)
+        if learns:
+            with cpu.DEVICE:  # device of the step counts of Adam
+                self._actor_steps.step()
+        return float(norm)
+
+    def _require_finite(self, norm: Tensor) -> None:
         if not bool(torch.isfinite(norm)):
             raise SimulationError(
                 f"Trainer.update: the gradient of update {self.updates} is not finite; a square "
                 "root or a norm in a reward has no derivative at 0"
             )
+
+    def _move_actions(
+        self, rollouts: Sequence[Rollout], seen: Tensor, learns: bool, step: float
+    ) -> dict[str, float]:
+        """Move the actions of all environments, and fit the policy to the moved actions."""
+        slopes = torch.cat([r.slopes for r in rollouts if r.slopes is not None], dim=1)
+        norms = torch.linalg.vector_norm(slopes, dim=(0, 2))
+        self._require_finite(norms.sum())
+        log = {"gradient_norm": float(norms.mean()), "change": 0.0}
         if learns:
-            with cpu.DEVICE:  # device of the step counts of Adam
-                self._actor_steps.step()
-        return float(norm)
+            log["change"] = fit_moved_actions(
+                self.policy,
+                seen,
+                slopes,
+                self._former,
+                step,
+                self.options.max_move,
+                self.options.fit_iterations,
+                self._actor_steps,
+                self._noise,
+            )
+        self._former = [*self._former, seen.flatten(0, 1)][-ROLLOUTS_KEPT:]
+        return log
+
+    def _draw_plan(self) -> None:
+        """Begin at the best of some plans near the first action, by their mean rewards."""
+        assert self.policy.actor.plan is not None
+        knots = self.policy.actor.plan.knots
+        first = chosen = knots.detach().clone()
+        best, steps = -math.inf, 0
+        try:
+            for k in range(self.options.draws):
+                each, common = (
+                    cpu.randn(*sizes, generator=self._noise, dtype=torch.float32)
+                    for sizes in (knots.shape, (1, knots.shape[1]))
+                )
+                drawn = first + _DRAWN * (each + common) if k else first
+                with torch.no_grad():
+                    knots.copy_(drawn)
+                rewards = _Rows(self._rollouts(learns=False)).rewards
+                steps += rewards.numel()
+                if float(rewards.mean()) > best:
+                    best, chosen = float(rewards.mean()), drawn
+        except BaseException:
+            chosen, steps = first, 0
+            raise
+        finally:
+            with torch.no_grad():
+                knots.copy_(chosen)
+            self.steps += steps
 
     def _fit_critics(self, rows: _Rows) -> float:
         o, policy = self.options, self.policy

@@ -217,7 +217,7 @@ class TestImprove:
         monkeypatch.setattr(task, "succeeded", lambda _, place: (place.held >= 0) & succeeds)
         found = improve(env, start, knots, 1, rate=2e-3)
         outcome = task.outcome
-        monkeypatch.setattr(plans_module, "_LAST_WEIGHT", 0.0)
+        monkeypatch.setattr(plans_module, "LAST_WEIGHT", 0.0)
         if not succeeds:
             monkeypatch.setattr(
                 task, "outcome", lambda t, p: outcome(t, p) * (1 + 3 * (p.elapsed > 3))
