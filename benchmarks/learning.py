@@ -6,7 +6,7 @@
 
 Each task, size, method, seed and budget is a line of JSON in the file of results; existing lines
 are not repeated, so an interrupted run continues. Rows that inform most come first: methods that
-learn nothing, imitation, then five methods that learn from rewards, all with the first seed; then
+learn nothing, imitation, then six methods that learn from rewards, all with the first seed; then
 other sizes and other seeds; plans at the end.
 
 `return` and `success` are means over the episodes, `interval` is the Wilson interval of the success

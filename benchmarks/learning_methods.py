@@ -4,11 +4,12 @@
 `imitate` is `dc.learn.imitate` of the script, with the settings of `configs/train_TASK.yaml`.
 `transfer` is the policy of `imitate` at another size. `plan` is `dc.learn.plan`.
 
-`apg`, `shac` and `sapo` are `dc.learn.Trainer`; `apg` has the options of
-`configs/train_TASK_gradients.yaml` where this file exists. `ppo` and `sac` are those of
-Stable-Baselines3, on the CPU, with their usual options except for the number of steps between
-updates and the initial noise. These five begin at the first action of the task, and return the
-policy after the last update.
+`apg`, `moves`, `shac` and `sapo` are `dc.learn.Trainer`. `moves` is APG with steps of actions
+(`action_step`), with equal options for all tasks. `apg` has the options of
+`configs/train_fold_gradients.yaml` on FoldCloth, and those of `OWN` on other tasks. `ppo` and `sac`
+are those of Stable-Baselines3, on the CPU, with their usual options except for the number of steps
+between updates and the initial noise. These six begin at the first action of the task, and return
+the policy after the last update.
 
 Methods that learn from rewards use soft grasps, which have gradients, in tasks with pickers.
 """
@@ -31,7 +32,7 @@ from diffcloth_torch.config.documents import read_document
 from diffcloth_torch.learn import Plans, Policy, Trainer, TrainerOptions, imitate, load_policy, plan
 
 UNLEARNED = ("zero", "random", "script", "replay")
-FIRST_ORDER, FREE = ("apg", "shac", "sapo"), ("ppo", "sac")
+FIRST_ORDER, FREE = ("apg", "moves", "shac", "sapo"), ("ppo", "sac")
 FROM_REWARDS = (*FREE, *FIRST_ORDER)  # with a budget of environment steps
 METHODS = (*UNLEARNED, "imitate", "transfer", *FROM_REWARDS, "plan")
 
@@ -40,6 +41,13 @@ PICKERS = ("FoldCloth", "FoldClothDiagonal", "SpreadCloth", "DropCloth", "FlingC
 NUM_ENVS = 4
 COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "init_std": 0.05, "target_entropy": -2.0}
 APG: dict[str, Any] = {"discount": 1.0, "learning_rate": 4e-3}
+OWN: dict[str, tuple[int, float]] = {"LiftCloth": (2, 4e-3), "PushCube": (4, 3e-3)}
+"""Number of environments and learning rate of `apg`."""
+MOVES: dict[str, Any] = {
+    "discount": 1.0, "learning_rate": 2e-3, "plan_learning_rate": 1e-2, "plan_knots": 12,
+    "action_step": 0.05, "draws": 16, "init_std": 0.02, "hidden": (128, 128),
+}  # fmt: skip
+NUM_MOVED = 8  # environments of `moves`
 WITH_CRITIC: dict[str, Any] = {"discount": 0.99, "learning_rate": 2e-3}
 _CONFIGS = Path(__file__).parents[1] / "configs"
 _REPLAYED = 20_000  # seed of the episode that is replayed
@@ -164,7 +172,8 @@ def _planned(job: Job) -> Plans:
 
 def _first_order(job: Job) -> Acts:
     found, num_envs = trainer_of(job)
-    updates = -(-job.budget // (num_envs * found.horizon))
+    drawn = found.draws if found.action_step else 0
+    updates = max(-(-job.budget // (num_envs * found.horizon)) - drawn, 1)
     options = TrainerOptions(**(vars(found) | {"decay_updates": updates}))
     trainer = Trainer(job.make, options, num_envs=num_envs)
     for _ in range(updates):
@@ -176,18 +185,18 @@ def trainer_of(job: Job) -> tuple[TrainerOptions, int]:
     """Options of a trainer for a job, and its number of environments."""
     env = job.make(num_envs=1)
     common = COMMON | {"first_action": env.task.first_action, "seed": job.seed}
+    whole = {"algorithm": "apg", "horizon": env.task.horizon}
+    if job.method == "moves":
+        return TrainerOptions(**(common | MOVES | whole)), NUM_MOVED
     if job.method != "apg":  # half episodes: a critic estimates the value of the rest
         half = {"algorithm": job.method, "horizon": env.task.horizon // 2}
         return TrainerOptions(**(common | WITH_CRITIC | half)), NUM_ENVS
-    for path in sorted(_CONFIGS.glob("train_*_gradients.yaml")):
-        document = read_document(path)
-        if document["environment"]["name"] == job.task:
-            given = {
-                n: tuple(v) if isinstance(v, list) else v for n, v in document["trainer"].items()
-            }
-            return TrainerOptions(**(given | {"seed": job.seed})), document["num_envs"]
-    whole = {"algorithm": "apg", "horizon": env.task.horizon}
-    return TrainerOptions(**(common | APG | whole)), NUM_ENVS
+    if job.task == "FoldCloth":
+        document = read_document(_CONFIGS / "train_fold_gradients.yaml")
+        given = {n: tuple(v) if isinstance(v, list) else v for n, v in document["trainer"].items()}
+        return TrainerOptions(**(given | {"seed": job.seed})), document["num_envs"]
+    num_envs, rate = OWN.get(job.task, (NUM_ENVS, APG["learning_rate"]))
+    return TrainerOptions(**(common | APG | {"learning_rate": rate} | whole)), num_envs
 
 
 def _free(job: Job) -> Acts:

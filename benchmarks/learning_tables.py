@@ -24,6 +24,7 @@ _COLUMNS = {
         ("minutes", "minutes"),
     ],
 }
+_NAMES = {"moves": "APG, steps of actions"}  # of methods, if not in capitals
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,9 @@ def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
             mine = _of(rows, task, method)
             for budget in sorted({row["budget"] for row in mine}):
                 same = [row for row in mine if row["budget"] == budget]
-                lines.append([f"`{task}`", method.upper(), *_cells(same, names)])
+                lines.append(
+                    [f"`{task}`", _NAMES.get(method, method.upper()), *_cells(same, names)]
+                )
     head = ["task", "method", "seeds", "success", "return", "steps", "minutes"]
     return table(head, lines)
 

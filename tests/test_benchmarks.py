@@ -620,6 +620,10 @@ def test_learning_uses_the_settings_of_the_configurations(tmp_path):
     assert options.plan_knots == document["trainer"]["plan_knots"]
     assert options.seed == 5
     assert num_envs == document["num_envs"]
+    options, num_envs = methods.trainer_of(dataclasses.replace(job, method="moves"))
+    assert (options.action_step, options.horizon, num_envs) == (0.05, 45, 8)
+    options, num_envs = methods.trainer_of(dataclasses.replace(job, task="PushCube"))
+    assert (options.learning_rate, options.plan_knots, num_envs) == (0.003, 0, 4)
     options, _ = methods.trainer_of(dataclasses.replace(job, method="sapo"))
     assert options.algorithm == "sapo"
     assert options.horizon == 22  # half of an episode
