@@ -172,8 +172,7 @@ def _planned(job: Job) -> Plans:
 
 def _first_order(job: Job) -> Acts:
     found, num_envs = trainer_of(job)
-    drawn = found.draws if found.action_step else 0
-    updates = max(-(-job.budget // (num_envs * found.horizon)) - drawn, 1)
+    updates = max(-(-job.budget // (num_envs * found.horizon)) - found.draws, 1)
     options = TrainerOptions(**(vars(found) | {"decay_updates": updates}))
     trainer = Trainer(job.make, options, num_envs=num_envs)
     for _ in range(updates):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.learn.policy import Policy
+from diffcloth_torch.learn.rollouts import unit_gradients
 
 __all__ = ["ROLLOUTS_KEPT", "fit_moved_actions", "moved_actions"]
 
@@ -24,7 +25,7 @@ ROLLOUTS_KEPT = 10
 """Number of former rollouts at whose observations a fit retains the actions."""
 
 _LARGEST_ACTION = 0.995  # moved actions are clipped to this, short of the ends of tanh
-_RETAINED_SHARE = 2  # retained observations in a step of the fit, relative to those of the rollout
+_FORMER_SHARE = 2  # number of former observations in a step of the fit, over those of the rollout
 
 
 def moved_actions(actions: Tensor, slopes: Tensor, step: float, largest: float) -> Tensor:
@@ -40,10 +41,8 @@ def moved_actions(actions: Tensor, slopes: Tensor, step: float, largest: float) 
     Returns:
         Moved actions [h, B, A], between -.995 and .995.
     """
-    norms = torch.linalg.vector_norm(slopes, dim=(0, 2), keepdim=True)
-    directions = torch.where(norms > 0, slopes / norms, 0.0)
     size = math.sqrt(slopes.shape[0] * slopes.shape[2])
-    moves = (step * size * directions).clamp(-largest, largest)
+    moves = (step * size * unit_gradients(slopes, (0, 2))).clamp(-largest, largest)
     return (actions + moves).clamp(-_LARGEST_ACTION, _LARGEST_ACTION)
 
 
@@ -77,15 +76,15 @@ def fit_moved_actions(
     Returns:
         Root mean square change of the actions of the rollout by the fit.
     """
-    with torch.no_grad():
-        before = policy(seen.flatten(0, 1)).unflatten(0, seen.shape[:2])
-        wanted = moved_actions(before, slopes, step, largest).flatten(0, 1)
-        before = before.flatten(0, 1)
-        retained = [policy(rows) for rows in former]
     rows = seen.flatten(0, 1)
+    with torch.no_grad():
+        before = policy(rows)
+        together = before.unflatten(0, seen.shape[:2])
+        wanted = moved_actions(together, slopes, step, largest).flatten(0, 1)
+        retained = [policy(each) for each in former]
     if former:
         other_rows, other_actions = torch.cat(former), torch.cat(retained)
-        count = min(len(other_rows), _RETAINED_SHARE * len(rows))
+        count = min(len(other_rows), _FORMER_SHARE * len(rows))
     for _ in range(iterations):
         loss = (policy(rows) - wanted).square().mean()
         if former:

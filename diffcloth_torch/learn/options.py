@@ -96,16 +96,18 @@ class TrainerOptions(_RefusesOldNames):
             actions of the rollout by this step, and the policy is fitted to the moved actions by
             `fit_iterations` steps of Adam, while its actions are retained at observations of the
             ten rollouts before. Rewards of the last `Task.holds` steps of an episode without
-            success count four times. The step falls with `decay_updates`; `max_grad_norm` has no
-            effect. Not with "sapo", whose loss depends on more than actions, nor with `feedback`.
-            None: a step of Adam along the gradient of the weights.
+            success count four times. The step falls with `decay_updates`, the scale of observations
+            is fixed after ten updates, and `max_grad_norm` has no effect. Not with "sapo", whose
+            loss depends on more than actions, nor with `feedback`. None: a step of Adam along the
+            gradient of the weights.
         max_move: Largest change of a number of an action at which an update with `action_step`
             aims. Where the gradient concentrates on few numbers, such as the effort of fingers, a
             large move crosses cliffs of the return.
         fit_iterations: Steps of Adam in an update with `action_step`.
-        draws: Number of plans near `first_action` of which the training begins at the best, by the
-            mean reward of a rollout without noise: the first action itself, and random plans. It
-            needs `plan_knots`. 0: the first action.
+        draws: Number of plans of which the training begins at the best, by the mean reward of a
+            rollout without noise: the initial plan, which is `first_action` or the plan of an
+            initial policy, and random plans near this plan. It needs `plan_knots`. 0: the initial
+            plan.
         hidden: Sizes of hidden layers.
         max_change: Largest change of actions by an update: root mean square, without noise, over
             the observations of the rollout. A larger update is scaled back. The scale of

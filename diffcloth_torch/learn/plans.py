@@ -29,7 +29,7 @@ from diffcloth_torch.envs.env import EnvState, add_steps, steps_made
 from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
-from diffcloth_torch.learn.rollouts import LAST_WEIGHT, MakeEnv, threads_of_torch
+from diffcloth_torch.learn.rollouts import LAST_WEIGHT, MakeEnv, threads_of_torch, unit_gradients
 from diffcloth_torch.learn.starts import LARGEST_SEED, part_seeds
 from diffcloth_torch.learn.workers import Workers, check_workers, pickled
 from diffcloth_torch.memory import check_memory
@@ -356,10 +356,9 @@ def _followed(
 
 
 def _normalized(env: ClothVectorEnv, slope: Tensor, iteration: int) -> Tensor:
-    """Divide gradients [n, T, A], each by its own norm; zero gradients remain zero."""
+    """Require finite gradients [n, T, A], and divide each by its own norm."""
     _require_finite(env, f"gradient of iteration {iteration}", slope.sum(dim=(1, 2)))
-    norms = torch.linalg.vector_norm(slope, dim=(1, 2), keepdim=True)
-    return torch.where(norms > 0, slope / norms, 0.0)
+    return unit_gradients(slope, (1, 2))
 
 
 def _require_finite(env: ClothVectorEnv, name: str, values: Tensor) -> None:

@@ -31,6 +31,7 @@ __all__ = [
     "roll_out",
     "roll_out_remotely",
     "threads_of_torch",
+    "unit_gradients",
 ]
 
 MakeEnv = Callable[..., ClothVectorEnv]
@@ -209,6 +210,17 @@ def environments(make_env: bytes, count: int) -> ClothVectorEnv:
         make: Any = pickle.loads(make_env)
         _made[key] = make(num_envs=count)
     return _made[key]
+
+
+def unit_gradients(slopes: Tensor, dim: tuple[int, ...]) -> Tensor:
+    """Divide the gradient of each environment by its own norm; zero gradients remain zero.
+
+    Args:
+        slopes: Derivatives of returns by actions.
+        dim: Dimensions of time and actions.
+    """
+    norms = torch.linalg.vector_norm(slopes, dim=dim, keepdim=True)
+    return torch.where(norms > 0, slopes / norms, 0.0)
 
 
 @contextmanager
