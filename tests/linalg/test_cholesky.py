@@ -220,7 +220,7 @@ def test_levels_with_fused_arithmetic_agree_in_every_bit(name, backend):
     assert np.array_equal(first, second)
 
 
-@pytest.mark.quick("portable", "avx512, single")
+@pytest.mark.quick("portable", f"{LEVELS[-1]}, single")
 @pytest.mark.parametrize(("backend", "level"), METHODS)
 def test_threads_do_not_disturb_each_other(backend, level):
     """Eight threads factor and solve at once, at sizes at which a shared BLAS once failed."""
