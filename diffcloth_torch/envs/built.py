@@ -79,7 +79,8 @@ class BuiltTask(Task):
             frame: Axes of observations and actions: "task", fixed at the start of an episode, or
                 "world".
             randomize: Whether to draw physical parameters at each start, or their ranges by name:
-                "stretch", "bending", "density", "friction", "drag", "mass".
+                "stretch", "bending", "density", "friction", "drag", "mass", and "scale", the scale
+                of the sheet, in tasks with a sheet on a table.
         """
         owner = operation(self.name)
         self.side = check_count(f"{owner}: `size`", size, 4)

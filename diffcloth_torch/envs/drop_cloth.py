@@ -10,7 +10,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, graded, lengths
-from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, at, follow, uniform
+from diffcloth_torch.envs.sheets import HEIGHT, SheetTask, at, follow, uniform
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["DropCloth"]
@@ -39,15 +39,16 @@ class DropCloth(SheetTask):
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Upright, with the rest shape's x as height."""
-        x, y, _ = self.flat(len(drawn["turn"])).unbind(dim=-1)
-        height = x + SIDE / 2 + drawn["height"][:, None] + HEIGHT
+        x, y, _ = self.flat(drawn).unbind(dim=-1)
+        height = x + 0.5 * self.sides(drawn)[:, None] + drawn["height"][:, None] + HEIGHT
         return torch.stack([torch.zeros_like(x), y, height], dim=-1)
 
     def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """Also the goals of all vertices, and of the corners among them."""
-        x, y, z = self.flat(len(state)).unbind(dim=-1)
+        x, y, z = self.flat(drawn).unbind(dim=-1)
+        x = x + 0.5 * self.sides(drawn)[:, None]
         away = drawn["away"][:, None]
-        flat = torch.stack([x + SIDE / 2 + away[..., 0], y + away[..., 1], z], dim=-1)
+        flat = torch.stack([x + away[..., 0], y + away[..., 1], z], dim=-1)
         drawn["flat"] = self.posed(flat, drawn)
         drawn["goal"] = drawn["flat"][:, self._corners]
         return super().started(state, drawn)
@@ -67,11 +68,12 @@ class DropCloth(SheetTask):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
+        side = self.sides(env.drawn)
+        return graded(self.distance(env), _CLOSE * side, 0.5 * side)
 
     def success(self, env: EnvState) -> Tensor:
         """Return whether the mean distance is below .1 of the side."""
-        return self.distance(env) < _CLOSE * SIDE
+        return self.distance(env) < _CLOSE * self.sides(env.drawn)
 
     def scripted(self, env: EnvState) -> Tensor:
         """Move the lower edge over its place, lower it, lay the sheet down about it, release."""
@@ -79,7 +81,7 @@ class DropCloth(SheetTask):
         picked = env.drawn["picked"]
         edge = cpu.tensor([self.vertex(0, 0), self.vertex(-1, 0)], dtype=torch.int64)
         foot, out = flat[:, edge], at(flat, picked) - flat[:, edge]
-        up = cpu.tensor([0.0, 0.0, SIDE])
+        up = self.sides(env.drawn)[:, None, None] * cpu.tensor([0.0, 0.0, 1.0])
         begin = at(start, picked)
         high = torch.cat([foot[..., :2], begin[..., 2:]], dim=-1)
         # The parts that lie and that hang are together as long as the sheet.

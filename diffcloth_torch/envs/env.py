@@ -121,6 +121,7 @@ class Task(ABC):
         name: Name of the task in `make`, and "diffcloth/NAME-v0" in gymnasium.
         worst: The smallest reward of a transition.
         holds: Number of last transitions in which a task must be done for success.
+        scales: Whether `randomize` may draw a scale of the cloths: `place` then scales the start.
         simulator: Simulator of the scene, shared by all environments.
         actuator: Conversion of actions to controls.
         horizon: Transitions after which an episode ends.
@@ -132,6 +133,7 @@ class Task(ABC):
     name: ClassVar[str]
     worst: ClassVar[float] = -1.0
     holds: ClassVar[int] = 5
+    scales: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -157,7 +159,7 @@ class Task(ABC):
         self.horizon = check_count(f"{owner}: `horizon`", horizon, 1)
         self.substeps = check_count(f"{owner}: `substeps`", substeps, 1)
         self.frame = check_choice(f"{owner}: `frame`", frame, FRAMES)
-        self._randomization = Randomization(owner, simulator, randomize)
+        self._randomization = Randomization(owner, simulator, randomize, self.scales)
         self._stop: SafetyStop | None = None
 
     @abstractmethod
@@ -343,15 +345,15 @@ class Task(ABC):
         return self.initial(cpu.generator().manual_seed(0), 1)
 
 
-def graded(distance: Tensor, tolerance: float, length: float) -> Tensor:
+def graded(distance: Tensor, tolerance: float | Tensor, length: float | Tensor) -> Tensor:
     """Reward [B] between -1 and 1, with a gradient everywhere that is largest near success.
 
     The reward is s(4 (1 - d/t)) - tanh(d/l) with the logistic function s.
 
     Args:
         distance: d, the distance from success [m], [B].
-        tolerance: t, the distance at which a task counts as done [m].
-        length: l, the length over which rewards distinguish distances [m].
+        tolerance: t, the distance at which a task counts as done [m], a number or [B].
+        length: l, the length over which rewards distinguish distances [m], a number or [B].
     """
     near = torch.sigmoid(4.0 - (4.0 / tolerance) * distance)
     return near - torch.tanh(distance / length)

@@ -12,7 +12,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, graded, lengths
-from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, at, follow
+from diffcloth_torch.envs.sheets import SheetTask, arc, at, follow
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
@@ -117,11 +117,12 @@ class FoldCloth(SheetTask):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
+        side = self.sides(env.drawn)
+        return graded(self.distance(env), _CLOSE * side, 0.5 * side)
 
     def success(self, env: EnvState) -> Tensor:
         """Return whether the distance is below a tenth of the side."""
-        return self.distance(env) < _CLOSE * SIDE
+        return self.distance(env) < _CLOSE * self.sides(env.drawn)
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, move them over in an arc, put them down, release."""

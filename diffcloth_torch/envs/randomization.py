@@ -27,6 +27,7 @@ _FIELDS = {
     "friction": "friction",
     "drag": "normal_drag",
     "mass": "body_mass",
+    "scale": "rest_positions",
 }
 RANDOMIZED = tuple(_FIELDS)
 """Names of the parameters that can be drawn."""
@@ -41,6 +42,7 @@ _MULTIPLES = {
 }
 _DRAG = (0.0, 1.5)  # values, not multiples, as the materials of most scenes have no drag
 _PREFIX = "random_"
+_LACKS = "the scene has nothing with"
 
 
 class Randomization:
@@ -48,12 +50,13 @@ class Randomization:
 
     Ranges have the units of values: [N/m], [N m], [kg/m^2], [-], [-] and [kg] for stretch, bending,
     density, friction (of all pairs of surfaces), drag (normal) and mass (of each dynamic body,
-    whose inertia scales with its mass). A parameter is drawn uniformly in its logarithm if its
-    lower bound is positive, and uniformly in its value otherwise.
+    whose inertia scales with its mass). The scale multiplies the lengths of the rest shapes of all
+    cloths [-]. A parameter is drawn uniformly in its logarithm if its lower bound is positive, and
+    uniformly in its value otherwise.
     """
 
-    def __init__(self, owner: str, simulator: Simulator, ranges: Ranges) -> None:
-        """Check the ranges.
+    def __init__(self, owner: str, simulator: Simulator, ranges: Ranges, scales: bool) -> None:
+        """Check the ranges; `scales`: whether starts of the task follow the scale of the cloths.
 
         Raises:
             InvalidInput: If a name or a range is not accepted, or the scene has no such parameter.
@@ -73,14 +76,15 @@ class Randomization:
         dynamic = [body.motion == "dynamic" for body in scene.bodies]
         self._dynamic = cpu.tensor(dynamic, dtype=torch.bool)
         has = {name: getattr(defaults, field) is not None for name, field in _FIELDS.items()}
-        has["mass"] = any(dynamic)
+        has["mass"], has["scale"] = any(dynamic), scales
         if given is True:
             self._ranges = {n: r for n, r in (_MULTIPLES | {"drag": _DRAG}).items() if has[n]}
         else:
             for name, limits in given.items():
                 check_choice(f"{opening}: a name", name, RANDOMIZED)
                 if not has[name]:
-                    raise InvalidInput(f"{opening}: the scene has nothing with {name!r}")
+                    lacks = "starts of the task have no" if name == "scale" else _LACKS
+                    raise InvalidInput(f"{opening}: {lacks} {name!r}")
                 self._ranges[name] = _checked(f"{opening}: {name!r}", limits, name)
         fields = {_FIELDS[name] for name in self._ranges} | {"body_inertia"}
         self._defaults = {name: getattr(defaults, name) for name in fields}
@@ -118,6 +122,11 @@ class Randomization:
                 )
         return given.replace(**fields)
 
+    @staticmethod
+    def scale(drawn: Mapping[str, Tensor]) -> Tensor | float:
+        """Scale of the cloths of starts, [B], or 1 if it is not drawn."""
+        return drawn.get(_PREFIX + "scale", 1.0)
+
     def _fields(self, name: str, drawn: Tensor) -> dict[str, Tensor]:
         """Fields of `Parameters` for drawn numbers [B]."""
         default = self._defaults[_FIELDS[name]]
@@ -128,6 +137,8 @@ class Randomization:
             inertia = self._defaults["body_inertia"]
             ratio = torch.where(self._dynamic, masses / default, 1.0)
             return {"body_mass": masses, "body_inertia": ratio[..., None, None] * inertia}
+        if name == "scale":
+            return {"rest_positions": drawn[:, None, None] * default}
         if name == "friction":
             size = (self._surfaces, self._surfaces)
             return {name: self._valued(name, drawn[:, None, None], default.expand(size))}

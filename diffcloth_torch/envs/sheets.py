@@ -16,6 +16,7 @@ from diffcloth_torch.envs.built import BuiltTask, key_rows
 from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.frames import Frame, level_frame, points_in, vectors_in
+from diffcloth_torch.envs.randomization import Randomization
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions
@@ -25,7 +26,7 @@ from diffcloth_torch.sim.records.state import State
 
 __all__ = ["HEIGHT", "SIDE", "SheetTask", "arc", "at", "follow", "uniform"]
 
-SIDE = 0.3  # side of the sheet [m]
+SIDE = 0.3  # side of the sheet [m], unless its scale is drawn
 HEIGHT = 0.004  # height of the lying sheet [m]
 _MATERIAL = Material(bending=1e-5, damping=1e-3, friction=0.5)
 
@@ -49,6 +50,7 @@ class SheetTask(BuiltTask):
     """
 
     steps = 50
+    scales = True
     view = DepthCamera([0.65, -0.5, 0.75], [0.06, 0.0, 0.08])
     beside: ClassVar[float] = 0.012  # largest initial offset of a picker beside its vertex [m]
     above: ClassVar[tuple[float, float]] = (0.01, 0.02)  # range of its height above the vertex [m]
@@ -109,11 +111,16 @@ class SheetTask(BuiltTask):
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Positions [B, N, 3] of the sheet before its rotation and shift: flat on the table."""
-        return self.flat(len(drawn["turn"]))
+        return self.flat(drawn)
 
-    def flat(self, count: int) -> Tensor:
+    def sides(self, drawn: Mapping[str, Tensor]) -> Tensor:
+        """Sides of the sheets [m], [B]."""
+        return (SIDE * Randomization.scale(drawn)) * torch.ones_like(drawn["turn"])
+
+    def flat(self, drawn: Mapping[str, Tensor]) -> Tensor:
         """Positions [B, N, 3] of the flat sheet before its rotation and shift."""
-        return (self.rest + cpu.tensor([0.0, 0.0, HEIGHT])).expand(count, -1, -1)
+        scaled = (self.sides(drawn) / SIDE)[:, None, None] * self.rest
+        return scaled + cpu.tensor([0.0, 0.0, HEIGHT])
 
     def posed(self, points: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
         """Points [B, n, 3], rotated about the vertical and moved with the sheet."""
@@ -161,7 +168,8 @@ class SheetTask(BuiltTask):
     def features(self, env: EnvState) -> dict[str, Tensor]:
         """Key points and pickers, the corners at the start and the goal, in the frame of the task.
 
-        Lengths are in units of the side, velocities in m/s, forces in weights of a vertex.
+        Lengths are in units of .3 m, the side without a scale, velocities in m/s, forces in weights
+        of a vertex of that sheet.
         """
         state, rows, drawn = env.state, self.key_points, env.drawn
         points = [state.positions[:, rows], env.tools["points"], drawn["start"][:, self._corners]]

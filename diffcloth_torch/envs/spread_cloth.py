@@ -12,7 +12,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, failures, graded
-from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, at, follow, uniform
+from diffcloth_torch.envs.sheets import HEIGHT, SheetTask, at, follow, uniform
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.sim.records.state import State
 
@@ -28,24 +28,26 @@ _CLOSED = 9  # transitions of the script of FlingCloth until its pickers are clo
 _BARE = 0.06  # largest missing share of the area of a flat sheet for success
 
 
-def covered_area(positions: Tensor, spacing: float) -> Tensor:
+def covered_area(positions: Tensor, spacing: Tensor) -> Tensor:
     """Area covered by vertices as seen from above, smooth in their positions [m^2].
 
     Each cell of a grid counts 1 - exp(-c sum_i k(distance to vertex i)), with a Gaussian k.
 
     Args:
         positions: Positions of the vertices [m], shape [B, N, 3].
-        spacing: Distance of neighbors in the flat sheet [m].
+        spacing: Distance of neighbors in the flat sheet [m], shape [B].
     """
     centers = cpu.arange(-_EXTENT, _EXTENT, _CELL, dtype=torch.float64)
-    width = _WIDTH * max(spacing, _CELL)
+    width = _WIDTH * spacing.clamp(min=_CELL)
     x, y = (
-        torch.exp(-0.5 * ((centers[:, None] - positions[:, None, :, axis]) / width) ** 2)
+        torch.exp(
+            -0.5 * ((centers[:, None] - positions[:, None, :, axis]) / width[:, None, None]) ** 2
+        )
         for axis in (0, 1)
     )
     # Sums instead of a matrix product, whose rounding would depend on the size of the batch.
     near = torch.stack([(row[:, None] * y).sum(dim=-1) for row in x.unbind(dim=1)], dim=1)
-    fill = _FILL * (spacing / width) ** 2
+    fill = (_FILL * (spacing / width) ** 2)[:, None, None]
     return _CELL**2 * (1 - torch.exp(-fill * near)).sum(dim=(-1, -2))
 
 
@@ -65,10 +67,9 @@ class SpreadCloth(SheetTask):
     beside: ClassVar[float] = 0.04
     above: ClassVar[tuple[float, float]] = (0.02, 0.05)
 
-    @property
-    def spacing(self) -> float:
-        """Distance of vertices along a side [m]."""
-        return SIDE / (self.side - 1)
+    def area(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
+        """Area covered by sheets [m^2], [B]; see `covered_area`."""
+        return covered_area(positions, self.sides(drawn) / (self.side - 1))
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Also the steepness of the pleats, their phase, and their direction."""
@@ -89,12 +90,12 @@ class SpreadCloth(SheetTask):
         slope = drawn["steepness"][:, None] * torch.sin(
             2 * math.pi * _PLEATS * middle + drawn["phase"][:, None]
         )
-        step = SIDE / len(middle)
+        step = self.sides(drawn)[:, None] / len(middle)
         x = torch.nn.functional.pad((step * slope.cos()).cumsum(-1), (1, 0))[:, ::16]
         z = torch.nn.functional.pad((step * slope.sin()).cumsum(-1), (1, 0))[:, ::16]
         x = x - 0.5 * x[:, -1:]
         z = z - z.amin(dim=-1, keepdim=True) + HEIGHT
-        flat = self.flat(len(x))
+        flat = self.flat(drawn)
         across_x = torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
         # Rows of vertices lie along x: the transposed sheet has its pleats across y.
         across_y = across_x.reshape(-1, n, n, 3).transpose(1, 2).reshape(-1, n * n, 3)
@@ -114,14 +115,14 @@ class SpreadCloth(SheetTask):
                     environments=environments,
                 )
         state = state.replace(velocities=torch.zeros_like(state.velocities))
-        flat = self.posed(self.flat(len(state)), drawn)
-        drawn["largest_area"] = covered_area(flat, self.spacing)
+        flat = self.posed(self.flat(drawn), drawn)
+        drawn["largest_area"] = self.area(flat, drawn)
         drawn["goal"] = flat[:, self._corners]
         return super().started(state, drawn)
 
     def bare(self, env: EnvState) -> Tensor:
         """Share of the area of the flat sheet that is not covered [B]."""
-        return 1 - covered_area(env.state.positions, self.spacing) / env.drawn["largest_area"]
+        return 1 - self.area(env.state.positions, env.drawn) / env.drawn["largest_area"]
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
@@ -148,7 +149,7 @@ class SpreadCloth(SheetTask):
         """Close on the edges, pull them apart, release."""
         here = at(env.drawn["start"], env.drawn["picked"])
         along = self.along(env) * cpu.tensor([[-0.5], [0.5]])
-        apart = here.mean(dim=1, keepdim=True) + SIDE * along
+        apart = here.mean(dim=1, keepdim=True) + self.sides(env.drawn)[:, None, None] * along
         apart = torch.cat([apart[..., :2], torch.full_like(apart[..., 2:], 0.01)], dim=-1)
         up = cpu.tensor([0.0, 0.0, 0.03])
         return self.moves_to(
@@ -184,7 +185,7 @@ class FlingCloth(SpreadCloth):
     def amiss(self, env: EnvState) -> Tensor:
         """Share of the area that is not covered, and mean height in sides [B]."""
         height = env.state.positions[..., 2].mean(dim=-1) - HEIGHT
-        return self.bare(env) + height.clamp(min=0) / SIDE
+        return self.bare(env) + height.clamp(min=0) / self.sides(env.drawn)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
@@ -203,9 +204,10 @@ class FlingCloth(SpreadCloth):
         """Close on the corners, lift the sheet, lay it down along a line, and pull it."""
         here = at(env.drawn["start"], env.drawn["picked"])
         sign = (1 - 2 * env.drawn["edge"])[:, None, None]  # towards the held edge
-        along = sign * SIDE * self.along(env)
+        side = self.sides(env.drawn)[:, None, None]
+        along = sign * side * self.along(env)
         foot = torch.cat([here[..., :2], torch.zeros_like(here[..., 2:])], dim=-1) - 0.9 * along
-        up = cpu.tensor([0.0, 0.0, SIDE])
+        up = side * cpu.tensor([0.0, 0.0, 1.0])
         # The parts that lie and that hang are together as long as the sheet.
         laid = [foot + k / 6 * along + (1.02 - k / 6) * up for k in range(7)]
         # Friction with the table pulls out an edge that is turned under.

@@ -419,8 +419,9 @@ def test_covered_area_of_two_patches_adds_only_where_they_lie_apart(axis):
     patch = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(1, -1, 3)
     away = torch.zeros(3, dtype=torch.float64)
     away[axis] = 0.4
-    one = covered_area(patch, 0.05)
-    apart = covered_area(torch.cat([patch, patch + away], dim=1), 0.05)
-    above = covered_area(torch.cat([patch, patch + torch.tensor([0.0, 0.0, 0.1])], dim=1), 0.05)
+    spacing = torch.full((1,), 0.05, dtype=torch.float64)
+    one = covered_area(patch, spacing)
+    apart = covered_area(torch.cat([patch, patch + away], dim=1), spacing)
+    above = covered_area(torch.cat([patch, patch + torch.tensor([0.0, 0.0, 0.1])], dim=1), spacing)
     assert apart.item() == pytest.approx(2 * one.item(), rel=1e-3)
     assert one.item() < above.item() < 1.3 * one.item()

@@ -11,6 +11,7 @@ import diffcloth_torch as dc
 from diffcloth_torch import envs
 from diffcloth_torch.envs import env as env_module
 from diffcloth_torch.envs.env import graded
+from diffcloth_torch.envs.sheets import HEIGHT, SIDE
 
 NAMES = tuple(envs.TASKS)
 SMALL = 6
@@ -322,6 +323,7 @@ def test_ranges_hold_values():
         ({"colour": (0, 1)}, dc.InvalidInput, "`randomize`: a name must be one of"),
         ({"mass": (1, 2)}, dc.InvalidInput, "`randomize`: the scene has nothing with 'mass'"),
         ({"density": (0, 1)}, dc.InvalidInput, "'density' must be finite and > 0, the smaller"),
+        ({"scale": (0, 1)}, dc.InvalidInput, "'scale' must be finite and > 0, the smaller"),
         ({"friction": (2, 1)}, dc.InvalidInput, "'friction' must be finite and >= 0, the smaller"),
         ({"stretch": 5}, dc.InvalidInput, "'stretch' must be two numbers, got 5"),
         ({"stretch": (1, math.inf)}, dc.InvalidInput, "'stretch' must be finite"),
@@ -330,6 +332,59 @@ def test_ranges_hold_values():
 def test_ranges_that_are_refused(ranges, error, message):
     with pytest.raises(error, match=message):
         make("FoldCloth", randomize=ranges)
+
+
+SHEETS = ("FoldCloth", "FoldClothDiagonal", "DropCloth", "SpreadCloth", "FlingCloth")
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_a_scaled_sheet_moves_as_a_scene_with_a_sheet_of_its_size(name):
+    # The default stiffness of the barrier depends on the sheet of the simulator.
+    contact = dc.ContactOptions(barrier_distance=HEIGHT, barrier_stiffness=3e3)
+    env = make(name, 2, randomize={"scale": (0.8, 1.25)}, contact=contact)
+    env.reset(seed=4)
+    scales = env.env_state.drawn["random_scale"]
+    assert float(scales[0]) != float(scales[1])
+    start = env.env_state
+    cloth = env.task.simulator.scene.cloths[0]
+    faces = torch.tensor(cloth.faces, dtype=torch.int64)
+    rest = torch.tensor(cloth.rest_positions)
+
+    def length(points):  # mean length of sides of faces
+        corners = points[..., faces, :]
+        return (corners - corners.roll(1, dims=-2)).norm(dim=-1).mean(dim=(-1, -2))
+
+    torch.testing.assert_close(
+        length(start.state.positions), scales * length(rest), rtol=0.02, atol=0
+    )
+    env.step(env.scripted_actions())
+    for i, scale in enumerate(scales.tolist()):
+        task = make(name).task
+        pose = [0, 0, HEIGHT, 1, 0, 0, 0]
+        scene = task.simulator.scene
+        size, material = (task.side, task.side), scene.cloths[0].material
+        sheet = dc.Cloth.grid(size, SIDE * scale, name="sheet", pose=pose, material=material)
+        task.simulator = dc.Simulator(
+            dc.Scene([sheet], scene.bodies, attachments=scene.attachments),
+            task.simulator.dt,
+            contact=contact,
+            solver=task.simulator.solver,
+        )
+        own = start.rows(torch.tensor([i]))
+        after = task.transition(own, task.scripted(own))
+        expected = after.state.positions[0]
+        torch.testing.assert_close(
+            env.env_state.state.positions[i], expected, rtol=0, atol=1e-6 * SIDE
+        )
+        lone = make(name, contact=contact).task
+        apart = lone.transition(own, lone.scripted(own)).state.positions[0] - expected
+        assert float(apart.abs().max()) > 1e-4  # the sheet of .3 m moves otherwise
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - set(SHEETS)))
+def test_a_scale_is_refused_where_starts_have_none(name):
+    with pytest.raises(dc.InvalidInput, match="starts of the task have no 'scale'"):
+        make(name, randomize={"scale": (0.8, 1.25)})
 
 
 @pytest.mark.parametrize("name", NAMES)
