@@ -16,6 +16,7 @@ damping    A sheet oscillates about its hanging shape; damping that a fit to dat
            by the time step.
 drops      Random sheets fall on bodies and on themselves: the largest energy after contact over the
            energy at the start, speeds at the end, and steps that did not converge.
+damped     The same with damping of the material.
 cost       Processor time of a step on scenes of `benchmarks.scenes`, second order over Euler.
 """
 
@@ -36,7 +37,7 @@ import diffcloth_torch as dc
 from benchmarks.scenes import DT, SCENES, in_regime
 
 INTEGRATORS = ("implicit_euler", "second_order")
-PARTS = ("momentum", "drag", "explicit", "damping", "drops", "cost")
+PARTS = ("momentum", "drag", "explicit", "damping", "drops", "damped", "cost")
 TRUE_DRAG = 1.5
 TRUE_DAMPING = 0.005  # [s]
 FINE = 16  # time steps of the reference in one of 0.01 s
@@ -56,6 +57,7 @@ def main(parts: Sequence[str], scenes: int, quick: bool) -> None:
             4 if quick else 6, 0.2 if quick else 1.0, (0.01,) if quick else (0.01, 0.005, 0.0025)
         ),
         "drops": lambda: print_drops(2 if quick else scenes, 0.2 if quick else 1.0),
+        "damped": lambda: print_drops(2 if quick else scenes, 0.2 if quick else 1.0, damped=True),
         "cost": lambda: print_cost((6,) if quick else (12, 24), 2 if quick else 12),
     }
     for part in parts or PARTS:
@@ -275,8 +277,8 @@ def print_damping(n: int, seconds: float, steps: Sequence[float]) -> None:
             )
 
 
-def random_drop(seed: int) -> tuple[dc.Scene, float, Tensor]:
-    """A scene, a time step, and velocities of the sheet."""
+def random_drop(seed: int, damped: bool = False) -> tuple[dc.Scene, float, Tensor]:
+    """A scene, a time step, and velocities of the sheet, whose damping is 1 to 50 ms or zero."""
     g = np.random.default_rng(seed)
     n = int(g.integers(4, 9))
     side = float(g.uniform(0.2, 0.6))
@@ -286,6 +288,8 @@ def random_drop(seed: int) -> tuple[dc.Scene, float, Tensor]:
         "friction": float(g.uniform(0.0, 0.8)),
         "density": float(g.uniform(0.08, 0.4)),
     }
+    if damped:
+        material["damping"] = float(10 ** np.random.default_rng(1000 + seed).uniform(-3, -1.3))
     cloth = sheet(n, side, **material)
     axis = g.normal(size=3)
     turn = torch.linalg.matrix_exp(
@@ -309,7 +313,7 @@ def random_drop(seed: int) -> tuple[dc.Scene, float, Tensor]:
     return scene, float(g.choice([0.003, 0.005, 0.01, 0.02])), velocities
 
 
-def print_drops(count: int, seconds: float) -> None:
+def print_drops(count: int, seconds: float, damped: bool = False) -> None:
     """Largest energies after contact by the time step, and speeds at the end."""
     print(
         f"{'integrator':<16}{'h [s]':>8}{'scenes':>8}{'largest E / E0':>16}{'kinetic alone':>15}"
@@ -318,7 +322,7 @@ def print_drops(count: int, seconds: float) -> None:
     for integrator in INTEGRATORS:
         found: dict[float, list[tuple[float, float, float, int, int]]] = {}
         for seed in range(count):
-            h, *numbers = drop(seed, integrator, seconds)
+            h, *numbers = drop(seed, integrator, seconds, damped)
             found.setdefault(h, []).append(tuple(numbers))
         for h in sorted(found):
             gains, kinetic, speeds, failed, steps = zip(*found[h], strict=True)
@@ -330,9 +334,11 @@ def print_drops(count: int, seconds: float) -> None:
         sys.stdout.flush()
 
 
-def drop(seed: int, integrator: str, seconds: float) -> tuple[float, float, float, float, int, int]:
+def drop(
+    seed: int, integrator: str, seconds: float, damped: bool = False
+) -> tuple[float, float, float, float, int, int]:
     """One scene: time step, largest energy, largest without elasticity, speed, failures, steps."""
-    scene, h, velocities = random_drop(seed)
+    scene, h, velocities = random_drop(seed, damped)
     sim = dc.Simulator(scene, h, integrator=integrator, solver=dc.SolverOptions(throw=False))
     state = sim.initial_state()
     state = state.replace(velocities=state.velocities + velocities)

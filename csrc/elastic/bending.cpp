@@ -3,6 +3,7 @@
 #include <array>
 
 #include "common/outer_product.h"
+#include "elastic/damping.h"
 #include "linalg/block_pattern.h"
 
 namespace diffcloth::elastic::bending {
@@ -147,6 +148,26 @@ Mat3 body_curvature(const Element& element, const double* x) {
   return frame(base_gradient(element, x)).R.transpose() * second_derivatives(element, x);
 }
 
+namespace {
+
+/// Visit the positions on which start_curvature() depends, with the share of their curvature.
+template <class Visit>
+void for_each_share(const Start& start, const Visit& visit) {
+  if (start.ahead == nullptr) return visit(start.x_n, 1.0);
+  visit(start.x_n, 1.0 + damping::kAhead);
+  visit(start.ahead, -damping::kAhead);
+}
+
+}  // namespace
+
+Mat3 start_curvature(const Element& element, const Start& start) {
+  if (start.ahead == nullptr) return body_curvature(element, start.x_n);
+  Mat3 sum = Mat3::Zero();
+  for_each_share(start,
+                 [&](const double* x, double share) { sum += share * body_curvature(element, x); });
+  return sum;
+}
+
 double energy(const Element& element, const double* x) {
   const Mat3 s =
       element.flat ? second_derivatives(element, x) : Mat3(body_curvature(element, x) - *element.b);
@@ -248,11 +269,11 @@ ScalarBars energy_bars(Element element,
 ScalarBars mixed(const Element& element,
                  FormDerivatives derivatives,
                  const double* x,
-                 const double* x_n,
+                 const Start& start,
                  const double* z,
                  const GeometryBars& bars) {
   const bool with_rest = bars.c != nullptr;
-  if (element.flat && x_n == nullptr && !with_rest) {
+  if (element.flat && start.x_n == nullptr && !with_rest) {
     return constant_mixed(element, derivatives, x, z, nullptr);
   }
   const BodyState state = body_state(element, x);
@@ -266,7 +287,7 @@ ScalarBars mixed(const Element& element,
   for (std::size_t k = 0; k < derivatives.size(); ++k) {
     result.form[k] = element.weight * (s * derivatives[k]).cwiseProduct(change.ds).sum();
   }
-  if (x_n != nullptr) {
+  if (start.x_n != nullptr) {
     // Also if the damping is zero, as its derivative is not.
     const Mat3 s_n = state.curvature - *element.b_n;
     const Mat3 ds_n = change.ds + cross_columns(change.w, *element.b - *element.b_n);
@@ -284,38 +305,46 @@ ScalarBars mixed(const Element& element,
     scatter_geometry(element, R * change.dq_total(), R * change.V, x, bars);
     scatter_geometry(element, R * state.q_total(), R * frame_stress(state), z, bars);
   }
-  if (element.damping != 0.0 && x_n != nullptr) {
-    // b_n = R(x_n)^T Y(x_n)
+  if (element.damping != 0.0 && start.x_n != nullptr) {
     const Mat3 b_bar = cross_columns(change.w, state.q_n) - change.dq_n;
-    const Frame frame_n = frame(base_gradient(element, x_n));
-    const Mat3 Y_bar = frame_n.R * b_bar;
-    const Mat32 F_bar = -frame_n.R * rotation_adjoint(frame_n, sum_of_crosses(*element.b_n, b_bar));
-    scatter(element, Y_bar, F_bar, bars.x_n);
-    if (with_rest) scatter_geometry(element, Y_bar, F_bar, x_n, bars);
+    for_each_share(start, [&](const double* at, double share) {
+      // b = R^T Y
+      const Frame there = frame(base_gradient(element, at));
+      const Mat3 b = body_curvature(element, at);
+      const Mat3 Y_bar = there.R * (share * b_bar);
+      const Mat32 F_bar = -there.R * rotation_adjoint(there, sum_of_crosses(b, share * b_bar));
+      scatter(element, Y_bar, F_bar, at == start.x_n ? bars.x_n : bars.ahead);
+      if (with_rest) scatter_geometry(element, Y_bar, F_bar, at, bars);
+    });
   }
   return result;
 }
 
 namespace {
 
-/// The change of b_n = R(x_n)^T Y(x_n).
+/// The change of start_curvature().
 Mat3 start_curvature_change(const Element& element,
                             const Element& moved,
-                            const double* x_n,
+                            const Start& start,
                             const Tangents& dot) {
-  const Frame frame_n = frame(base_gradient(element, x_n));
-  const Mat3 Rt = frame_n.R.transpose();
-  Mat3 Y_dot = Mat3::Zero();
-  Mat32 F_dot = Mat32::Zero();
-  if (dot.x_n != nullptr) {
-    Y_dot += second_derivatives(element, dot.x_n);
-    F_dot += base_gradient(element, dot.x_n);
-  }
-  if (dot.c != nullptr) {
-    Y_dot += second_derivatives(moved, x_n);
-    F_dot += base_gradient(moved, x_n);
-  }
-  return Rt * Y_dot - cross_columns(rotation(frame_n, Rt * F_dot), *element.b_n);
+  Mat3 change = Mat3::Zero();
+  for_each_share(start, [&](const double* at, double share) {
+    const Frame there = frame(base_gradient(element, at));
+    const Mat3 Rt = there.R.transpose();
+    Mat3 Y_dot = Mat3::Zero();
+    Mat32 F_dot = Mat32::Zero();
+    if (const double* const at_dot = at == start.x_n ? dot.x_n : dot.ahead; at_dot != nullptr) {
+      Y_dot += second_derivatives(element, at_dot);
+      F_dot += base_gradient(element, at_dot);
+    }
+    if (dot.c != nullptr) {
+      Y_dot += second_derivatives(moved, at);
+      F_dot += base_gradient(moved, at);
+    }
+    const Mat3 b = body_curvature(element, at);
+    change += share * (Rt * Y_dot - cross_columns(rotation(there, Rt * F_dot), b));
+  });
+  return change;
 }
 
 }  // namespace
@@ -340,7 +369,7 @@ void add_constant_tangent(const Element& element, const double* u, const Tangent
 // As in body_change(), with the changes of c and g instead of the changes of x, and additionally the
 // changes of b, b_n and Q.
 void add_tangent(
-    const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y) {
+    const Element& element, const double* x, const Start& start, const Tangents& dot, double* y) {
   const bool with_rest = dot.c != nullptr;
   const Mat3 dQ = dot.weight * element.form + element.weight * dot.form;
   if (element.flat && !with_rest && dot.damping == 0.0) {
@@ -367,9 +396,9 @@ void add_tangent(
   const Mat3 ds = RtY - cross_columns(w, *element.b) - db;
   Mat3 dq = ds * state.Q + (state.curvature - *element.b) * dQ;
   Vec3 dtau = sum_of_crosses(*element.b, dq) + sum_of_crosses(db, state.q);
-  if (x_n != nullptr && (element.damping != 0.0 || dot.damping != 0.0)) {
+  if (start.x_n != nullptr && (element.damping != 0.0 || dot.damping != 0.0)) {
     const Mat3& b_n = *element.b_n;
-    const Mat3 db_n = start_curvature_change(element, moved, x_n, dot);
+    const Mat3 db_n = start_curvature_change(element, moved, start, dot);
     const Mat3 s_n = state.curvature - b_n;
     const Mat3 ds_n = RtY - cross_columns(w, b_n) - db_n;
     const Mat3 dq_n = element.damping * (ds_n * state.Q + s_n * dQ) + dot.damping * (s_n * state.Q);

@@ -70,12 +70,23 @@ ScalarBars constant_mixed(const Element& element,
                           const double* z,
                           double* c_bar);
 
+/// Where damping begins: the start of a step and, for steps of second order, a prediction of its end.
+struct Start {
+  const double* x_n;    ///< [N, 3], or null without a start
+  const double* ahead;  ///< [N, 3], or null without a prediction
+};
+
+/// b_n: the body-frame curvature at x_n, or with a prediction  b(x_n) - kAhead (b(ahead) - b(x_n));  see
+/// damping.h.
+Mat3 start_curvature(const Element& element, const Start& start);
+
 /// Destinations of the cotangents of the geometry of an element. Null pointers are skipped.
 struct GeometryBars {
   double* c = nullptr;               ///< 3 a vertex
   mesh::ShapeGradient* g = nullptr;  ///< gradient of the base triangle
   Mat3* b = nullptr;
-  double* x_n = nullptr;  ///< [N, 3]
+  double* x_n = nullptr;    ///< [N, 3]
+  double* ahead = nullptr;  ///< [N, 3], read with a prediction alone
 };
 
 /// Cotangents for phi = seed E, without damping; bars.x_n is unchanged.
@@ -88,11 +99,11 @@ ScalarBars energy_bars(Element element,
                        const GeometryBars& bars,
                        double* x_bar);
 
-/// @param x_n  start of the step, or null if there is none (element.b_n is then not read)
+/// @param start  without a start, element.b_n is not read
 ScalarBars mixed(const Element& element,
                  FormDerivatives derivatives,
                  const double* x,
-                 const double* x_n,
+                 const Start& start,
                  const double* z,
                  const GeometryBars& bars);
 
@@ -104,7 +115,8 @@ struct Tangents {
   const double* c = nullptr;               ///< 3 a vertex; if given, g and b are as well
   const mesh::ShapeGradient* g = nullptr;  ///< gradient of the base triangle
   const Mat3* b = nullptr;
-  const double* x_n = nullptr;  ///< [N, 3]
+  const double* x_n = nullptr;    ///< [N, 3]
+  const double* ahead = nullptr;  ///< [N, 3]
 };
 
 /// y += the change of weight Y(u) Q with these tangents, over the element: constant_mixed(), transposed;
@@ -113,8 +125,8 @@ void add_constant_tangent(const Element& element, const double* u, const Tangent
 
 /// y += the change of grad E with these tangents: mixed(), transposed.
 ///
-/// @param x_n  as for mixed()
+/// @param start  as for mixed()
 void add_tangent(
-    const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y);
+    const Element& element, const double* x, const Start& start, const Tangents& dot, double* y);
 
 }  // namespace diffcloth::elastic::bending

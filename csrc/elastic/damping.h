@@ -14,6 +14,24 @@ namespace diffcloth::elastic::damping {
 /// which is invariant under rigid motion. F_n is F at the start of the step. Energies, gradients and
 /// Hessians of many triangles are in stretch_lanes.h. (The damping of bending is the bending energy
 /// about the curvature at the start of the step: see bending.h.)
+///
+/// A step of second order has a prediction of its end, with the gradient F_a, and evaluates elasticity
+/// at the end minus the predicted displacement, near the start. C_n above is then
+///
+///   C_n - kAhead (C_a - C_n),   kAhead = 2,
+///
+/// so that E, with half the weight, resists the mean of the predicted rate (C_a - C_n) / h and the rate
+/// of the step.
+
+/// See above.
+inline constexpr double kAhead = 2.0;
+
+/// F where damping begins.
+struct Start {
+  Mat32 F_n;
+  Mat32 F_a;
+  double ahead;  ///< kAhead with a prediction, else 0
+};
 
 /// C - C_n without the cancellation of the identity.
 inline Mat2 strain(const Mat32& F, const Mat32& F_n) {
@@ -21,18 +39,33 @@ inline Mat2 strain(const Mat32& F, const Mat32& F_n) {
   return dF.transpose() * F + F_n.transpose() * dF;
 }
 
+/// Likewise, with a prediction.
+inline Mat2 strain(const Mat32& F, const Start& start) {
+  const Mat2 since_start = strain(F, start.F_n);
+  if (start.ahead == 0.0) return since_start;
+  return since_start + start.ahead * strain(start.F_a, start.F_n);
+}
+
+/// Change of the strain along changes of F_n and F_a.
+Mat2 start_change(const Start& start, const Start& change);
+
+/// Gradients of <strain, bar> with respect to F_n and F_a.
+Start start_bar(const Start& start, const Mat2& bar);
+
 /// dE/dF = weight / 2 F (C - C_n).
-inline Mat32 stress(double weight, const Mat32& F, const Mat32& F_n) {
-  return 0.5 * weight * F * strain(F, F_n);
+inline Mat32 stress(double weight, const Mat32& F, const Start& start) {
+  return 0.5 * weight * F * strain(F, start);
 }
 
 /// Change of the stress along a change G of F.
-Mat32 stress_change(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G);
+Mat32 stress_change(double weight, const Mat32& F, const Start& start, const Mat32& G);
 
-/// Change of the stress along a change G_n of F_n.
-Mat32 start_change(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G_n);
+/// Change of the stress along a change of the start.
+inline Mat32 stress_change(double weight, const Mat32& F, const Start& start, const Start& change) {
+  return 0.5 * weight * F * start_change(start, change);
+}
 
-/// Gradient of phi = <stress, G> with respect to F_n, G fixed.
-Mat32 start_bar(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G);
+/// Gradients of phi = <stress, G> with respect to F_n and F_a, G fixed.
+Start start_bar(double weight, const Mat32& F, const Start& start, const Mat32& G);
 
 }  // namespace diffcloth::elastic::damping

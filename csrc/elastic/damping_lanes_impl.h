@@ -15,7 +15,7 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// C - C_n.
+/// C - C_n, with a prediction C - C_n + kAhead (C_a - C_n).
 DIFFCLOTH_INLINE Symmetric strain_of(const DampingBatch& batch, const Gradient& F, int l) {
   const Gradient F_n = gradient_of(batch.start, l);
   Gradient dF;
@@ -23,7 +23,10 @@ DIFFCLOTH_INLINE Symmetric strain_of(const DampingBatch& batch, const Gradient& 
     dF.a[k] = F.a[k] - F_n.a[k];
     dF.b[k] = F.b[k] - F_n.b[k];
   }
-  return change_of_square(dF, F, F_n);
+  const Symmetric since_start = change_of_square(dF, F, F_n);
+  return {.uu = since_start.uu + batch.gained[0][l],
+          .uv = since_start.uv + batch.gained[1][l],
+          .vv = since_start.vv + batch.gained[2][l]};
 }
 
 /// Forces of a triangle on its corners 1 and 2, by its strain since the start of the step.

@@ -25,7 +25,7 @@ void add_face_product(const Model& model, Index f, const double* x, const double
   const Mat32 G = face_gradient(model, f, z);
   Mat32 P = stretch_stress_change(model, f, F, G);
   if (is_damped(model, f)) {
-    P += damping_stress_change(model, f, F, face_gradient(model, f, model.x_n), G);
+    P += damping_stress_change(model, f, F, damping_start(model, f), G);
   }
   scatter(model, f, P, y);
 }
@@ -72,7 +72,7 @@ void prepare_start(const Model& model, Prepared& prepared) {
   put_start_gradients(model, prepared.damped, prepared.damping_of_stretch);
   for (Index e = 0; e < model.stencils->size(); ++e) {
     if (prepared.damping[e] == 0.0) continue;
-    prepared.curvature_n[e] = bending::body_curvature(bending_element(model, e), model.x_n);
+    prepared.curvature_n[e] = bending::start_curvature(bending_element(model, e), start_of(model));
   }
   put_start_curvatures(prepared.curvature_n, prepared.bent);
 }
@@ -214,8 +214,9 @@ void PreparedCache::prepare(Model& model, const Slots& slots) {
   const double h = damped ? model.h : 0.0;
   std::vector<double> start;
   if (damped && model.x_n != nullptr) {
-    start.assign(model.x_n,
-                 model.x_n + 3 * static_cast<std::ptrdiff_t>(model.topology->vertex_count));
+    const auto size = 3 * static_cast<std::ptrdiff_t>(model.topology->vertex_count);
+    start.assign(model.x_n, model.x_n + size);
+    if (model.ahead != nullptr) start.insert(start.end(), model.ahead, model.ahead + size);
   }
   const std::array<const std::vector<double>*, kFields> fields = {
       &model.stretch,      &model.bending,       &model.poisson,      &model.damping,
@@ -395,6 +396,7 @@ Bar::Bar(const mesh::Topology& topology, const mesh::BendingStencils& stencils)
       bending_weft(topology.faces.size(), 0.0),
       bending_twill(topology.faces.size(), 0.0),
       rest(topology, stencils),
-      x_n(3 * static_cast<std::size_t>(topology.vertex_count), 0.0) {}
+      x_n(3 * static_cast<std::size_t>(topology.vertex_count), 0.0),
+      ahead(x_n) {}
 
 }  // namespace diffcloth::elastic

@@ -53,7 +53,7 @@ struct Prepared {
   std::vector<Mat3> form;             ///< [B]
   std::vector<double> damping;        ///< [B] k_d / h [-]
   std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
-  std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, zero if not damped
+  std::vector<Mat3> curvature_n;      ///< [B] bending::start_curvature(), zero if not damped
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
   std::vector<double> identity;       ///< [slots] sum of all elements' multiples of I
   std::vector<StretchBatch> stretch;  ///< batches of isotropic faces
@@ -82,6 +82,7 @@ struct Model {
   const std::vector<Vec2>* axes = nullptr;  ///< [F] the warp in the rest frames
   double h = 0.0;                           ///< time step [s]; only damping needs it
   const double* x_n = nullptr;              ///< [N, 3] start of the step [m]; only damping needs it
+  const double* ahead = nullptr;            ///< [N, 3] prediction of its end, if any: see damping.h
   double least_inertia = 0.0;               ///< smallest M / h^2 of a vertex [N/m]
   const Elements* held = nullptr;  ///< elements with a prescribed corner; only for backward
   std::shared_ptr<const Prepared> prepared;  ///< result of prepare()
@@ -111,7 +112,7 @@ class PreparedCache {
     std::array<std::vector<double>, kFields> fields;
     double least_inertia;
     double h;                   ///< time step of a model with damping, else zero
-    std::vector<double> start;  ///< x_n of a model with damping, else empty
+    std::vector<double> start;  ///< x_n and the prediction of a model with damping, else empty
     std::shared_ptr<const Prepared> prepared;
     std::size_t bytes;
   };
@@ -179,7 +180,7 @@ struct Bar {
   std::vector<double> stretch, bending, poisson, damping;                        ///< [F]
   std::vector<double> stretch_weft, stretch_shear, bending_weft, bending_twill;  ///< [F]
   mesh::RestShapeBar rest;
-  std::vector<double> x_n;  ///< [3 N] through damping
+  std::vector<double> x_n, ahead;  ///< [3 N] through damping
 
   Bar() = default;
   /// All zero.
@@ -198,7 +199,7 @@ void add_mixed(const Model& model, const double* x, const double* z, bool with_r
 struct Changing {
   bool materials = false;
   bool rest = false;
-  bool start = false;  ///< x_n
+  bool start = false;  ///< x_n, and the prediction if the model has one
 };
 
 /// y += d/d theta (grad_x E(x; theta)) theta_dot over all vertices, damping included: add_mixed(),

@@ -2,6 +2,7 @@
 #include "elastic/damping.h"
 #include "elastic/elastic.h"
 #include "elastic/elements.h"
+#include "elastic/face_terms.h"
 #include "elastic/form_numbers.h"
 #include "elastic/frame.h"
 #include "elastic/stretch.h"
@@ -35,23 +36,21 @@ void add_face_damping_mixed(
   const double area = model.rest->area[f];
   const double rate = model.damping[f] / model.h;
   const Mat32 F = face_gradient(model, f, x);
-  const Mat32 F_n = face_gradient(model, f, model.x_n);
+  const damping::Start start = damping_start(model, f);
   const Mat32 G = face_gradient(model, f, z);
-  const Mat32 unit = damping::stress(1.0, F, F_n);
+  const Mat32 unit = damping::stress(1.0, F, start);
   const double work = unit.cwiseProduct(G).sum();
   bar.damping[f] += k_s * area * work / model.h;
   if (rate == 0.0) return;
 
   const double weight = rate * k_s * area;
   bar.stretch[f] += rate * area * work;
-  const Mat32 F_n_bar = damping::start_bar(weight, F, F_n, G);
-  scatter(model, f, F_n_bar, bar.x_n.data());
+  add_damping_start(model, f, damping::start_bar(weight, F, start, G), with_rest, bar);
   if (with_rest) {
     bar.rest.area[f] += rate * k_s * work;
     mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
-    scatter_gradient_bar(model, f, damping::stress_change(weight, F, F_n, G), x, g_bar);
+    scatter_gradient_bar(model, f, damping::stress_change(weight, F, start, G), x, g_bar);
     scatter_gradient_bar(model, f, weight * unit, z, g_bar);
-    scatter_gradient_bar(model, f, F_n_bar, model.x_n, g_bar);
   }
 }
 
@@ -59,6 +58,7 @@ void add_face_damping_mixed(
 bending::GeometryBars geometry_bars(const Model& model, Index e, bool with_rest, Bar& bar) {
   bending::GeometryBars geometry;
   geometry.x_n = bar.x_n.data();
+  geometry.ahead = bar.ahead.data();
   if (with_rest) {
     geometry.c = bar.rest.curvature_operator.data() + 3 * model.stencils->start[e];
     geometry.g = &bar.rest.shape_gradient[model.stencils->faces[e][0]];
@@ -72,12 +72,13 @@ void add_bending_mixed(
   bending::Element element = differentiable_element(model, e);
   Mat3 curvature_n;
   if (model.x_n != nullptr) {
-    curvature_n = bending::body_curvature(element, model.x_n);
+    curvature_n = bending::start_curvature(element, start_of(model));
     element.b_n = &curvature_n;
   }
   const FormNumbers numbers(model, e);
-  const bending::ScalarBars scalar = bending::mixed(element, numbers.derivatives(), x, model.x_n, z,
-                                                    geometry_bars(model, e, with_rest, bar));
+  const bending::ScalarBars scalar =
+      bending::mixed(element, numbers.derivatives(), x, start_of(model), z,
+                     geometry_bars(model, e, with_rest, bar));
   add_weight_bars(model, e, scalar, with_rest, bar);
   if (model.x_n != nullptr) add_to_faces(model, e, scalar.damping / model.h, bar.damping);
 }
@@ -106,18 +107,14 @@ void add_face_tangent(const Model& model,
     const double rate = model.damping[f] / model.h;
     const double rate_dot = changing.materials ? dot.damping[f] / model.h : 0.0;
     if (rate != 0.0 || rate_dot != 0.0) {
-      const Mat32 F_n = face_gradient(model, f, model.x_n);
-      const Mat32 unit_n = damping::stress(1.0, F, F_n);
+      const damping::Start start = damping_start(model, f);
+      const Mat32 unit_n = damping::stress(1.0, F, start);
       const double weight = rate * k_s * area;
       change += (rate_dot * k_s * area + rate * (k_dot * area + k_s * area_dot)) * unit_n;
       P += weight * unit_n;
-      Mat32 F_n_dot = Mat32::Zero();
-      if (changing.start) F_n_dot += face_gradient(model, f, dot.x_n.data());
-      if (changing.rest) {
-        F_n_dot += face_gradient(model, f, dot.rest.shape_gradient[f], model.x_n);
-        change += damping::stress_change(weight, F, F_n, F_dot);
-      }
-      change += damping::start_change(weight, F, F_n, F_n_dot);
+      if (changing.rest) change += damping::stress_change(weight, F, start, F_dot);
+      change +=
+          damping::stress_change(weight, F, start, damping_start_change(model, f, dot, changing));
     }
   }
   scatter(model, f, change, y);
@@ -145,13 +142,16 @@ void add_bending_tangent(const Model& model,
     tangents.g = &dot.rest.shape_gradient[model.stencils->faces[e][0]];
     tangents.b = &dot.rest.curvature[e];
   }
-  if (changing.start) tangents.x_n = dot.x_n.data();
+  if (changing.start) {
+    tangents.x_n = dot.x_n.data();
+    tangents.ahead = dot.ahead.data();
+  }
   Mat3 curvature_n;
   if (model.x_n != nullptr) {
-    curvature_n = bending::body_curvature(element, model.x_n);
+    curvature_n = bending::start_curvature(element, start_of(model));
     element.b_n = &curvature_n;
   }
-  bending::add_tangent(element, x, model.x_n, tangents, y);
+  bending::add_tangent(element, x, start_of(model), tangents, y);
 }
 
 // E = k_s A W(F), with dW/dF the stress of unit weight.

@@ -73,8 +73,9 @@ void ElasticPotential::add_tangent(const double* x, double* y) const {
   elastic::add_tangent(model_, x, dot_, changing_, y);
 }
 
-void ElasticPotential::subtract_from_start_tangent(const std::vector<double>& change) {
-  for (std::size_t a = 0; a < dot_.x_n.size(); ++a) dot_.x_n[a] -= change[a];
+void ElasticPotential::set_ahead_tangent(const std::vector<double>& ahead_dot) {
+  dot_.ahead.assign(ahead_dot.begin(),
+                    ahead_dot.begin() + static_cast<std::ptrdiff_t>(dot_.x_n.size()));
   changing_.start = true;
 }
 

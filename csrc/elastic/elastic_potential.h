@@ -71,8 +71,8 @@ class ElasticPotential final : public Potential {
   const Bar& tangent() const { return dot_; }
   const Changing& changing() const { return changing_; }
 
-  /// Subtract a change from the tangent of x_n.
-  void subtract_from_start_tangent(const std::vector<double>& change);
+  /// Set the tangent of the model's prediction, at least [3 N].
+  void set_ahead_tangent(const std::vector<double>& ahead_dot);
 
  private:
   const Model& model_;

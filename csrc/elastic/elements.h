@@ -111,6 +111,11 @@ inline bending::Element bending_element(const Model& model, Index e) {
           .flat = prepared.flat[e] != 0};
 }
 
+/// Where the damping of bending begins.
+inline bending::Start start_of(const Model& model) {
+  return {.x_n = model.x_n, .ahead = model.ahead};
+}
+
 inline std::span<const Index> bending_slots(const Slots& slots, Index e) {
   return {slots.bending.data() + slots.bending_start[e],
           static_cast<std::size_t>(slots.bending_start[e + 1] - slots.bending_start[e])};

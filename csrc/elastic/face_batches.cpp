@@ -111,7 +111,7 @@ std::vector<DampingBatch> damping_batches(const Model& model,
   std::vector<DampingBatch> batches;
   for (const WovenBatch& batch : batches_of(FaceLanes(model, slots, faces),
                                             [&](Index f) { return damping_weave(model, f); })) {
-    batches.push_back({.woven = batch, .start = {}});
+    batches.push_back({.woven = batch, .start = {}, .gained = {}});
   }
   return batches;
 }
@@ -121,9 +121,17 @@ void put_start_gradients(const Model& model,
                          std::vector<DampingBatch>& batches) {
   for (std::size_t i = 0; i < kStretchLanes * batches.size(); ++i) {
     const Index f = faces[std::min(i, faces.size() - 1)];
-    const Mat32 F = face_gradient(model, f, model.x_n) * damping_weave(model, f).axes();
-    for (int k = 0; k < 6; ++k)
-      batches[i / kStretchLanes].start[k][i % kStretchLanes] = F.data()[k];
+    const Mat2 axes = damping_weave(model, f).axes();
+    const damping::Start start = damping_start(model, f);
+    const Mat32 F = start.F_n * axes;
+    DampingBatch& batch = batches[i / kStretchLanes];
+    const std::size_t lane = i % kStretchLanes;
+    for (int k = 0; k < 6; ++k) batch.start[k][lane] = F.data()[k];
+    if (start.ahead == 0.0) continue;
+    const Mat2 gained = start.ahead * damping::strain(start.F_a * axes, F);
+    batch.gained[0][lane] = gained(0, 0);
+    batch.gained[1][lane] = gained(0, 1);
+    batch.gained[2][lane] = gained(1, 1);
   }
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include "elastic/damping.h"
 #include "elastic/elastic.h"
 #include "elastic/frame.h"
 #include "elastic/weave.h"
@@ -7,7 +8,7 @@
 namespace diffcloth::elastic {
 
 // Stretch and damping of one face of a model, isotropic or orthotropic, by its deformation gradient F;
-// F_n is the gradient at the start of the step. See stretch.h, damping.h and orthotropic_*.h.
+// damping has a start. See stretch.h, damping.h and orthotropic_*.h.
 
 double stretch_energy(const Model& model, Index f, const Mat32& F);
 
@@ -24,7 +25,21 @@ Weave stretch_weave(const Model& model, Index f);
 /// Likewise for its damping.
 Weave damping_weave(const Model& model, Index f);
 
+/// Where the damping of a face begins; the model has a start of the step.
+damping::Start damping_start(const Model& model, Index f);
+
+/// Likewise, the tangent.
+damping::Start damping_start_change(const Model& model,
+                                    Index f,
+                                    const Bar& dot,
+                                    const Changing& changing);
+
+/// Add the cotangent of where the damping of a face begins to the cotangents of positions, and with
+/// `with_rest` to those of the rest shape.
+void add_damping_start(
+    const Model& model, Index f, const damping::Start& start_bar, bool with_rest, Bar& bar);
+
 Mat32 damping_stress_change(
-    const Model& model, Index f, const Mat32& F, const Mat32& F_n, const Mat32& G);
+    const Model& model, Index f, const Mat32& F, const damping::Start& start, const Mat32& G);
 
 }  // namespace diffcloth::elastic

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/types.h"
+#include "elastic/damping.h"
 #include "elastic/frame.h"
 #include "elastic/weave.h"
 
@@ -15,15 +16,24 @@ namespace diffcloth::elastic::orthotropic_damping {
 /// and deformation gradients in the rest frame; W(D) = weave.times_in_rest_frame(D).
 
 /// dE/dF = 1/2 F W(C - C_n).
-Mat32 stress(const Weave& weave, const Mat32& F, const Mat32& F_n);
+Mat32 stress(const Weave& weave, const Mat32& F, const damping::Start& start);
 
 /// Change of the stress along a change G of F.
-Mat32 stress_change(const Weave& weave, const Mat32& F, const Mat32& F_n, const Mat32& G);
+Mat32 stress_change(const Weave& weave,
+                    const Mat32& F,
+                    const damping::Start& start,
+                    const Mat32& G);
 
-/// Change of the stress along a change G_n of F_n.
-Mat32 start_change(const Weave& weave, const Mat32& F, const Mat32& F_n, const Mat32& G_n);
+/// Change of the stress along a change of the start.
+Mat32 stress_change(const Weave& weave,
+                    const Mat32& F,
+                    const damping::Start& start,
+                    const damping::Start& change);
 
-/// Gradient of phi = <stress, G> with respect to F_n, G fixed.
-Mat32 start_bar(const Weave& weave, const Mat32& F, const Mat32& F_n, const Mat32& G);
+/// Gradients of phi = <stress, G> with respect to F_n and F_a, G fixed.
+damping::Start start_bar(const Weave& weave,
+                         const Mat32& F,
+                         const damping::Start& start,
+                         const Mat32& G);
 
 }  // namespace diffcloth::elastic::orthotropic_damping

@@ -109,6 +109,7 @@ void add_stretch_blocks(const Model& model,
   damped.h = 1.0;
   damped.damping.assign(model.damping.size(), 1.0);
   damped.x_n = u;
+  damped.ahead = nullptr;
   std::vector<Index> faces(model.topology->faces.size());
   std::iota(faces.begin(), faces.end(), 0);
   std::vector<DampingBatch> batches = damping_batches(damped, slots, faces);

@@ -39,6 +39,7 @@ struct DampingBatch {
   WovenBatch woven;  ///< weaves with stiffnesses times k_d / h
   double start[6]
               [kStretchLanes];  ///< F at the start of the step in the same axes, column by column
+  double gained[3][kStretchLanes];  ///< kAhead (C_a - C_n) of damping.h likewise: uu, uv, vv; or 0
 };
 
 /// Triangles that a displacement d strains while a step turns them: see chord_strain.h.

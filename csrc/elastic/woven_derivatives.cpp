@@ -1,6 +1,7 @@
 #include "elastic/woven_derivatives.h"
 
 #include "elastic/elements.h"
+#include "elastic/face_terms.h"
 #include "elastic/frame.h"
 #include "elastic/orthotropic_damping.h"
 #include "elastic/orthotropic_stretch.h"
@@ -35,24 +36,22 @@ void add_woven_damping_mixed(
   const double area = model.rest->area[f];
   const double rate = model.damping[f] / model.h;
   const Mat32 F = face_gradient(model, f, x);
-  const Mat32 F_n = face_gradient(model, f, model.x_n);
+  const damping::Start start = damping_start(model, f);
   const Mat32 G = face_gradient(model, f, z);
-  const Mat32 P = orthotropic_damping::stress(k, F, F_n);
+  const Mat32 P = orthotropic_damping::stress(k, F, start);
   bar.damping[f] += area * along(P, G) / model.h;
   if (rate == 0.0) return;
 
   for_each_stiffness(k, f, bar, [&](const Weave& one, double& k_bar) {
-    k_bar += rate * area * along(orthotropic_damping::stress(one, F, F_n), G);
+    k_bar += rate * area * along(orthotropic_damping::stress(one, F, start), G);
   });
   const Weave damped = k.scaled(rate * area);
-  const Mat32 F_n_bar = orthotropic_damping::start_bar(damped, F, F_n, G);
-  scatter(model, f, F_n_bar, bar.x_n.data());
+  add_damping_start(model, f, orthotropic_damping::start_bar(damped, F, start, G), with_rest, bar);
   if (!with_rest) return;
   bar.rest.area[f] += rate * along(P, G);
   mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
-  scatter_gradient_bar(model, f, orthotropic_damping::stress_change(damped, F, F_n, G), x, g_bar);
+  scatter_gradient_bar(model, f, orthotropic_damping::stress_change(damped, F, start, G), x, g_bar);
   scatter_gradient_bar(model, f, rate * area * P, z, g_bar);
-  scatter_gradient_bar(model, f, F_n_bar, model.x_n, g_bar);
 }
 
 // y_p += dP g_p + P g_dot_p, with P the stress of stretch and damping, and its change dP.
@@ -80,16 +79,14 @@ void add_woven_tangent(const Model& model,
   if (model.x_n != nullptr) {
     const double rate = model.damping[f] / model.h;
     const double rate_dot = changing.materials ? dot.damping[f] / model.h : 0.0;
-    const Mat32 F_n = face_gradient(model, f, model.x_n);
-    Mat32 F_n_dot = Mat32::Zero();
-    if (changing.start) F_n_dot += face_gradient(model, f, dot.x_n.data());
-    if (changing.rest) F_n_dot += face_gradient(model, f, dot.rest.shape_gradient[f], model.x_n);
+    const damping::Start start = damping_start(model, f);
     const Weave damped = k.scaled(rate * area);
-    P += orthotropic_damping::stress(damped, F, F_n);
-    change += orthotropic_damping::stress(k.scaled(rate_dot * area), F, F_n) +
-              orthotropic_damping::stress(force_dot.scaled(rate), F, F_n) +
-              orthotropic_damping::stress_change(damped, F, F_n, F_dot) +
-              orthotropic_damping::start_change(damped, F, F_n, F_n_dot);
+    P += orthotropic_damping::stress(damped, F, start);
+    change += orthotropic_damping::stress(k.scaled(rate_dot * area), F, start) +
+              orthotropic_damping::stress(force_dot.scaled(rate), F, start) +
+              orthotropic_damping::stress_change(damped, F, start, F_dot) +
+              orthotropic_damping::stress_change(damped, F, start,
+                                                 damping_start_change(model, f, dot, changing));
   }
   scatter(model, f, change, y);
   if (changing.rest) scatter(model, f, P, dot.rest.shape_gradient[f], y);

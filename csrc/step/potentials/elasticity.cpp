@@ -61,7 +61,9 @@ elastic::Model make_model(const Problem& p) {
   }
   model.poisson.resize(p.scene.face_cloth.size(), 0.0);
   model.axes = &p.scene.material_axes;
-  model.h = p.h;
+  // Steps of second order count damping over the filter and the step: see elastic/damping.h.
+  const bool twice = p.scene.given.integrator == Integrator::kSecondOrder;
+  model.h = twice ? 2.0 * p.h : p.h;
   model.x_n = p.inputs.data(Input::kPositions);
   model.held = &p.scene.held_elements;
   if (!p.masses.empty()) model.least_inertia = std::ranges::min(p.masses) / (p.h * p.h);
@@ -76,8 +78,8 @@ Elasticity::Elasticity(const Problem& problem, const Gradients* wanted)
       potential_(
           model_, problem.scene.slots, problem.scene.elastic_patterns.base(), of_model(wanted)) {}
 
-void Elasticity::begin_at(const Problem& problem, const double* start) {
-  model_.x_n = start;
+void Elasticity::predict(const Problem& problem, const double* end) {
+  model_.ahead = end;
   if (!model_.prepared->has_damping) return;
   prepare(problem, model_);
   potential_.renew();

@@ -20,10 +20,11 @@ class Elasticity final : public StepPotential {
 
   const elastic::Model& model() const { return model_; }
 
-  /// Set the start of damping to other positions, which must outlive this object.
+  /// Let damping resist the mean of a predicted rate and the rate of the step: see elastic/damping.h. The
+  /// time step of the model is twice the time step of the problem.
   ///
-  /// @param start  [N, 3] [m]
-  void begin_at(const Problem& problem, const double* start);
+  /// @param end  prediction of the end of the step [N, 3] [m]; outlives this object
+  void predict(const Problem& problem, const double* end);
 
  private:
   elastic::Model model_;

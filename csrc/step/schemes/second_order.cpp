@@ -189,11 +189,10 @@ class Filter {
 /// elastic::ChordStrain. In smooth motion e is of third order in h.
 class ShiftedStage {
  public:
-  /// @param y  all points at the end of the filter
+  /// @param y  all points at the end of the filter; outlives this
   ShiftedStage(Problem& p, const Array& y)
       : p_(p),
         shift_(p.start.size(), 0.0),
-        start_(p.cloth_size),
         guess_(p.inertia.target()),
         middle_(middle(p)),
         elastic_(p.find<Elasticity>().potential(), shift_),
@@ -206,11 +205,10 @@ class ShiftedStage {
     // Inertia leads to x_n + h v_n; strain absorbs the difference to y.
     const Array coasting = p.coasting();
     for (std::size_t a = 0; a < p.cloth_size; ++a) {
-      start_[a] = p.start[a] - shift_[a];
       guess_[a] += y[a] - coasting[a];
       middle_[a] += 0.5 * shift_[a];
     }
-    p.find<Elasticity>().begin_at(p, start_.data());
+    p.find<Elasticity>().predict(p, y.data());
   }
 
   ContactStage stage() {
@@ -240,10 +238,8 @@ class ShiftedStage {
       for (std::size_t a = 0; a < potential->shift_bar.size(); ++a)
         bar[a] += potential->shift_bar[a];
     }
-    // Damping begins at x_n - d.
-    const elastic::Bar& model = p_.find<Elasticity>().potential().bar();
     for (std::size_t a = 0; a < p_.cloth_size; ++a) {
-      bar[a] += chords_.shift_bar[a] + 0.5 * chords_.center_bar[a] - model.x_n[a];
+      bar[a] += chords_.shift_bar[a] + 0.5 * chords_.center_bar[a];
     }
     pull_back_middle(p_, chords_.center_bar, bars);
     Array rows(p_.coordinates.size(), 0.0);
@@ -259,6 +255,8 @@ class ShiftedStage {
       bars.start[a] -= bar[a];
     }
     add_to_ends(p_, std::move(ends_bar), bars);
+    const elastic::Bar& model = p_.find<Elasticity>().potential().bar();
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) rows[a] += model.ahead[a];
     return rows;
   }
 
@@ -275,7 +273,7 @@ class ShiftedStage {
         dot[a] = ends_dot[a] - tangents.start[a];
       }
     }
-    p_.find<Elasticity>().potential().subtract_from_start_tangent(dot);
+    p_.find<Elasticity>().potential().set_ahead_tangent(y_dot);
     chords_.center_dot = middle_tangent(p_, tangents, ends_dot);
     for (std::size_t a = 0; a < dot.size(); ++a) chords_.center_dot[a] += 0.5 * dot[a];
     chords_.shift_dot = dot;
@@ -285,7 +283,6 @@ class ShiftedStage {
  private:
   Problem& p_;
   Array shift_;  ///< d
-  Array start_;  ///< x_n - d of the cloths
   Array guess_;
   Array middle_;  ///< u + d / 2 of the cloths
   Shifted elastic_;

@@ -9,11 +9,12 @@ namespace diffcloth::step {
 ///
 ///   1. Filter:  (M + h^2 S(u)) d = M h v_n,   u = x_n + h v_n / 2,  S the stiffness against strain rates;
 ///      prescribed points have d = their motion.
-///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + E(x) + barrier + friction + drag,
+///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + D(x - d) + E(x) + barrier + friction + drag,
 ///      v' = (x' - x_n) / h,
 ///
-/// W is the energy of elasticity, damping and springs; drag is evaluated at the mean of v_n and v'; E is
-/// the energy of elastic/chord_strain.h, which keeps the strain small that d would cause where contact
+/// W is the energy of elasticity and springs. D is the damping potential, by the mean of the strain
+/// rates of the filter and of the step (elastic/damping.h); drag is evaluated at the mean of v_n and v'. E is the
+/// energy of elastic/chord_strain.h, which keeps the strain small that d would cause where contact
 /// turns faces.
 ///
 /// With d = h v_n this is leapfrog on the Moreau envelope of W, with velocities at the middle of steps:
