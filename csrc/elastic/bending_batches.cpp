@@ -22,6 +22,7 @@ void put_element(const Model& model, Index e, int l, bool counts, BendingBatch& 
   }
   batch.damping[l] = element.damping;
   for (k = 0; k < 9; ++k) batch.b[k][l] = element.b->data()[k];
+  if (!element.b->isZero(0.0)) batch.curved = 1;
 }
 
 void put_points(const Model& model, const Slots& slots, Index e, int l, BendingPoint* points) {
@@ -54,6 +55,7 @@ BendingBatches bending_batches(const Model& model,
     batch.points = points_of(elements[first]);
     batch.first = static_cast<Index>(result.points.size());
     batch.size = 1;
+    batch.curved = 0;
     while (batch.size < kBendingLanes && first + batch.size < count &&
            points_of(elements[first + batch.size]) == batch.points) {
       ++batch.size;

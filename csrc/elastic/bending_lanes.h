@@ -27,6 +27,7 @@ struct BendingBatch {
   std::int32_t size;              ///< number of used lanes
   std::int32_t points;            ///< vertices of an element
   std::int32_t first;             ///< index of the batch's first point
+  std::int32_t curved;            ///< 0 if b is zero in all lanes
   double g[4][kBendingLanes];     ///< shape gradients of corners 1 and 2 of the base triangle [1/m]
   double Q[6][kBendingLanes];     ///< lower triangle of weight Q, row by row
   double damping[kBendingLanes];  ///< k_d / h [-]

@@ -120,6 +120,16 @@ DIFFCLOTH_INLINE double inner(const Matrix& a, const Matrix& b) {
   return result;
 }
 
+/// Call f<kCurved>(): without curvature at rest, the terms of b are left out, which are zero.
+template <class Call>
+DIFFCLOTH_INLINE void with_curved(const BendingBatch& batch, Call call) {
+  if (batch.curved != 0) {
+    call.template operator()<true>();
+  } else {
+    call.template operator()<false>();
+  }
+}
+
 /// Y, and the sides of the base triangle.
 struct Shape {
   Lanes<9> Y;
@@ -216,6 +226,11 @@ DIFFCLOTH_INLINE Matrix rotation_of(const Polar& polar) {
   return R;
 }
 
+/// Half the change of s : s Q, in world axes, for s with a start and a change.
+DIFFCLOTH_INLINE double half_change(const Matrix& s0, const Matrix& ds, const Form& Q) {
+  return 0.5 * inner(times_form(1.0, sum(sum(s0, s0), ds), Q), ds);
+}
+
 /// weight / 2 (|s1 Q|^2 - |s0 Q|^2) in world axes, of s = Y - R b.
 DIFFCLOTH_INLINE double change_of_term(const Matrix& Y0,
                                        const Matrix& dY,
@@ -223,9 +238,7 @@ DIFFCLOTH_INLINE double change_of_term(const Matrix& Y0,
                                        const Matrix& dR,
                                        const Matrix& b,
                                        const Form& Q) {
-  const Matrix s0 = difference(Y0, turned(R0, b));
-  const Matrix ds = difference(dY, turned(dR, b));
-  return 0.5 * inner(times_form(1.0, sum(sum(s0, s0), ds), Q), ds);
+  return half_change(difference(Y0, turned(R0, b)), difference(dY, turned(dR, b)), Q);
 }
 
 /// Work conjugates of the curvature in the body frame, of both terms, and the torque on the frame.
@@ -234,19 +247,28 @@ struct Stress {
   Vector tau;
 };
 
+template <bool kCurved>
 DIFFCLOTH_INLINE Stress
 stress_of(const BendingBatch& batch, const Matrix& R, const Matrix& Y, const Form& Q, int l) {
-  const Matrix b = matrix_at(batch.b, l);
   const Matrix b_n = matrix_at(batch.b_n, l);
   const Matrix curvature = turned_back(R, Y);
   Stress result;
-  result.q = times_form(1.0, difference(curvature, b), Q);
   result.q_n = times_form(batch.damping[l], difference(curvature, b_n), Q);
   result.tau = {{0.0, 0.0, 0.0}};
-  for (int a = 0; a < 3; ++a) {
-    const Vector of_rest = cross(b.column[a], result.q.column[a]);
-    const Vector of_start = cross(b_n.column[a], result.q_n.column[a]);
-    for (int k = 0; k < 3; ++k) result.tau.at[k] += of_rest.at[k] + of_start.at[k];
+  if constexpr (kCurved) {
+    const Matrix b = matrix_at(batch.b, l);
+    result.q = times_form(1.0, difference(curvature, b), Q);
+    for (int a = 0; a < 3; ++a) {
+      const Vector of_rest = cross(b.column[a], result.q.column[a]);
+      const Vector of_start = cross(b_n.column[a], result.q_n.column[a]);
+      for (int k = 0; k < 3; ++k) result.tau.at[k] += of_rest.at[k] + of_start.at[k];
+    }
+  } else {
+    result.q = times_form(1.0, curvature, Q);
+    for (int a = 0; a < 3; ++a) {
+      const Vector of_start = cross(b_n.column[a], result.q_n.column[a]);
+      for (int k = 0; k < 3; ++k) result.tau.at[k] += of_start.at[k];
+    }
   }
   return result;
 }
@@ -257,13 +279,14 @@ struct Stresses {
   Lanes<6> F;
 };
 
+template <bool kCurved>
 DIFFCLOTH_INLINE void put_stresses(const BendingBatch& batch,
                                    const Polar& polar,
                                    const Matrix& R,
                                    const Matrix& Y,
                                    int l,
                                    Stresses& stresses) {
-  const Stress stress = stress_of(batch, R, Y, form_of(batch, l), l);
+  const Stress stress = stress_of<kCurved>(batch, R, Y, form_of(batch, l), l);
   const Matrix q = turned(R, sum(stress.q, stress.q_n));
   for (int a = 0; a < 3; ++a) put(q.column[a], a, l, stresses.Y.at);
   const double in_plane = stress.tau.at[2] / polar.t;
@@ -306,6 +329,16 @@ DIFFCLOTH_INLINE void add_forces(const BendingBatch& batch,
   }
 }
 
+template <bool kCurved>
+DIFFCLOTH_INLINE void find_stresses(const BendingBatch& batch,
+                                    const Shape& shape,
+                                    Stresses& stresses) {
+  for (int l = 0; l < kLanes; ++l) {
+    const Polar polar = polar_at(batch, shape.sides, l);
+    put_stresses<kCurved>(batch, polar, rotation_of(polar), matrix_at(shape.Y.at, l), l, stresses);
+  }
+}
+
 void add_gradient(const BendingBatch* batches,
                   std::size_t count,
                   const BendingPoint* points,
@@ -315,11 +348,34 @@ void add_gradient(const BendingBatch* batches,
     Shape shape;
     gather_at(*batch, points, x, shape);
     Stresses stresses;
-    for (int l = 0; l < kLanes; ++l) {
-      const Polar polar = polar_at(*batch, shape.sides, l);
-      put_stresses(*batch, polar, rotation_of(polar), matrix_at(shape.Y.at, l), l, stresses);
-    }
+    with_curved(*batch, [&]<bool kCurved> { find_stresses<kCurved>(*batch, shape, stresses); });
     add_forces(*batch, points, stresses, g);
+  }
+}
+
+/// Changes of energy of eight elements, and the stresses at the end of the motion.
+template <bool kCurved>
+DIFFCLOTH_INLINE void find_changes(const BendingBatch& batch,
+                                   const BendingMotion& motion,
+                                   double (&energy)[kLanes],
+                                   Stresses& stresses) {
+  for (int l = 0; l < kLanes; ++l) {
+    const Matrix R0 = rotation_of(polar_at(batch, motion.start.sides, l));
+    const Polar polar = polar_at(batch, motion.end.sides, l);
+    const Matrix R1 = rotation_of(polar);
+    const Matrix dR = difference(R1, R0);
+    const Matrix Y0 = matrix_at(motion.start.Y.at, l);
+    const Matrix dY = matrix_at(motion.change.at, l);
+    const Form Q = form_of(batch, l);
+    double rest;
+    if constexpr (kCurved) {
+      rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch.b, l), Q);
+    } else {
+      rest = half_change(Y0, dY, Q);
+    }
+    const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch.b_n, l), Q);
+    energy[l] = rest + batch.damping[l] * damped;
+    put_stresses<kCurved>(batch, polar, R1, matrix_at(motion.end.Y.at, l), l, stresses);
   }
 }
 
@@ -335,19 +391,8 @@ double energy_change(const BendingBatch* batches,
     gather_motion(*batch, points, x0, x1, motion);
     alignas(64) double energy[kLanes];
     Stresses stresses;
-    for (int l = 0; l < kLanes; ++l) {
-      const Matrix R0 = rotation_of(polar_at(*batch, motion.start.sides, l));
-      const Polar polar = polar_at(*batch, motion.end.sides, l);
-      const Matrix R1 = rotation_of(polar);
-      const Matrix dR = difference(R1, R0);
-      const Matrix Y0 = matrix_at(motion.start.Y.at, l);
-      const Matrix dY = matrix_at(motion.change.at, l);
-      const Form Q = form_of(*batch, l);
-      const double rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b, l), Q);
-      const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b_n, l), Q);
-      energy[l] = rest + batch->damping[l] * damped;
-      put_stresses(*batch, polar, R1, matrix_at(motion.end.Y.at, l), l, stresses);
-    }
+    with_curved(*batch,
+                [&]<bool kCurved> { find_changes<kCurved>(*batch, motion, energy, stresses); });
     if (g1 != nullptr) add_forces(*batch, points, stresses, g1);
     for (int l = 0; l < batch->size; ++l) total += energy[l];
   }
@@ -370,6 +415,7 @@ struct Parts {
   Lanes<9> epsilon;
 };
 
+template <bool kCurved>
 DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
                                  const Shape& shape,
                                  bool positive,
@@ -379,12 +425,17 @@ DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
     const Polar polar = polar_at(batch, shape.sides, l);
     const Matrix R = rotation_of(polar);
     const Form Q = form_of(batch, l);
-    const Stress stress = stress_of(batch, R, matrix_at(shape.Y.at, l), Q, l);
-    const Matrix b = matrix_at(batch.b, l);
+    const Stress stress = stress_of<kCurved>(batch, R, matrix_at(shape.Y.at, l), Q, l);
     const Matrix b_n = matrix_at(batch.b_n, l);
-    const Matrix of_rest = times_form(1.0, b, Q);
     const Matrix of_start = times_form(batch.damping[l], b_n, Q);
-    const Matrix bQ = sum(of_rest, of_start);
+    Matrix b;
+    Matrix of_rest;
+    Matrix bQ = of_start;
+    if constexpr (kCurved) {
+      b = matrix_at(batch.b, l);
+      of_rest = times_form(1.0, b, Q);
+      bQ = sum(of_rest, of_start);
+    }
     const Matrix world = turned(R, bQ);
     double M[3][3];
     double trace = 0.0;
@@ -393,10 +444,15 @@ DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
         double gauss_newton = 0.0;
         double geometric = 0.0;
         for (int a = 0; a < 3; ++a) {
-          gauss_newton += of_rest.column[a].at[i] * b.column[a].at[j] +
-                          of_start.column[a].at[i] * b_n.column[a].at[j];
-          geometric += stress.q.column[a].at[i] * b.column[a].at[j] +
-                       stress.q_n.column[a].at[i] * b_n.column[a].at[j];
+          if constexpr (kCurved) {
+            gauss_newton += of_rest.column[a].at[i] * b.column[a].at[j] +
+                            of_start.column[a].at[i] * b_n.column[a].at[j];
+            geometric += stress.q.column[a].at[i] * b.column[a].at[j] +
+                         stress.q_n.column[a].at[i] * b_n.column[a].at[j];
+          } else {
+            gauss_newton += of_start.column[a].at[i] * b_n.column[a].at[j];
+            geometric += stress.q_n.column[a].at[i] * b_n.column[a].at[j];
+          }
         }
         M[i][j] = gauss_newton + exact * geometric;
       }
@@ -586,7 +642,7 @@ void add_hessian(const BendingBatch* batches,
     Shape shape;
     Parts parts;
     gather_at(*batch, points, x, shape);
-    find_parts(*batch, shape, positive, parts);
+    with_curved(*batch, [&]<bool kCurved> { find_parts<kCurved>(*batch, shape, positive, parts); });
     const BendingPoint* const first = points + batch->first;
     alignas(64) Block outer[3] = {};
     for (int i = 3; i < batch->points; ++i) {
