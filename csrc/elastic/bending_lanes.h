@@ -35,26 +35,48 @@ struct BendingBatch {
   double b_n[9][kBendingLanes];   ///< likewise; zero without damping
 };
 
+/// The elements of a batch at one point: what every evaluation there begins with.
+struct BendingState {
+  double R[9][kBendingLanes];      ///< rotation of the frame, column by column
+  double S_inv[3][kBendingLanes];  ///< S^-1 of frame.h: 11, 12 and 22
+  double t[kBendingLanes];         ///< t of frame.h
+  double Y[9][kBendingLanes];      ///< sum_i x_i c_i^T, column by column
+};
+
 // NOLINTEND(modernize-avoid-c-arrays)
 
 /// The bending of many elements that are not flat, E of bending.h, in lanes. As in StretchKernels, all
 /// levels have the same bits.
 struct BendingKernels {
+  /// Compute the state of each batch at x.
+  ///
+  /// @param at  [count]
+  void (*evaluate)(const BendingBatch* batches,
+                   std::size_t count,
+                   const BendingPoint* points,
+                   const double* x,
+                   BendingState* at);
+
   /// E(x1) - E(x0) from differences of positions, summed in the order of the elements.
   ///
-  /// @param g1  += grad E(x1), with the bits of add_gradient(); null for none
+  /// @param dx     x1 - x0
+  /// @param start  states at x0
+  /// @param end    set to the states at x1, with the bits of evaluate()
+  /// @param g1     += grad E(x1), with the bits of add_gradient(); null for none
   double (*energy_change)(const BendingBatch* batches,
                           std::size_t count,
                           const BendingPoint* points,
-                          const double* x0,
                           const double* x1,
+                          const double* dx,
+                          const BendingState* start,
+                          BendingState* end,
                           double* g1);
 
-  /// g += grad E.
+  /// g += grad E, for the states at a point.
   void (*add_gradient)(const BendingBatch* batches,
                        std::size_t count,
                        const BendingPoint* points,
-                       const double* x,
+                       const BendingState* at,
                        double* g);
 
   /// blocks += the Hessian without its multiples of the identity,  (1 + damping) c_i^T Q c_j I  with the
@@ -72,7 +94,7 @@ struct BendingKernels {
   void (*add_hessian)(const BendingBatch* batches,
                       std::size_t count,
                       const BendingPoint* points,
-                      const double* x,
+                      const BendingState* at,
                       bool positive,
                       const std::int32_t* place,
                       double* blocks);

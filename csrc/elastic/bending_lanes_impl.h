@@ -151,11 +151,12 @@ DIFFCLOTH_INLINE void put_side(int i, const Lanes<3>& side, Lanes<6>& sides) {
   }
 }
 
-DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
+/// Call visit(i, side) for the sides x_i - x_0 of the elements.
+template <class Visit>
+DIFFCLOTH_INLINE void for_sides(const BendingBatch& batch,
                                 const BendingPoint* points,
                                 const double* x,
-                                Shape& shape) {
-  shape.Y = {};
+                                Visit visit) {
   const BendingPoint* const first = points + batch.first;
   for (int i = 1; i < batch.points; ++i) {
     Lanes<3> side;
@@ -164,47 +165,19 @@ DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
       const double* const at_0 = x + 3 * static_cast<std::ptrdiff_t>(first->vertex[l]);
       for (int k = 0; k < 3; ++k) side.at[k][l] = at[k] - at_0[k];
     }
-    add_to_shape(first[i], side, shape.Y);
-    if (i <= 2) put_side(i, side, shape.sides);
+    visit(i, side);
   }
 }
 
-/// Shapes of the elements at both ends of a motion, and the change of Y, summed from displacements.
-struct BendingMotion {
-  Shape start;
-  Shape end;
-  Lanes<9> change;  ///< change of Y
-};
-
-DIFFCLOTH_INLINE void gather_motion(const BendingBatch& batch,
-                                    const BendingPoint* points,
-                                    const double* x0,
-                                    const double* x1,
-                                    BendingMotion& motion) {
-  motion.start.Y = {};
-  motion.end.Y = {};
-  motion.change = {};
-  const BendingPoint* const first = points + batch.first;
-  for (int i = 1; i < batch.points; ++i) {
-    Lanes<3> start;
-    Lanes<3> end;
-    Lanes<3> change;
-    for (int l = 0; l < kLanes; ++l) {
-      const std::ptrdiff_t at = 3 * static_cast<std::ptrdiff_t>(first[i].vertex[l]);
-      const std::ptrdiff_t at_0 = 3 * static_cast<std::ptrdiff_t>(first->vertex[l]);
-      for (int k = 0; k < 3; ++k) {
-        start.at[k][l] = x0[at + k] - x0[at_0 + k];
-        end.at[k][l] = x1[at + k] - x1[at_0 + k];
-        change.at[k][l] = (x1[at + k] - x0[at + k]) - (x1[at_0 + k] - x0[at_0 + k]);
-      }
-    }
-    add_to_shape(first[i], start, motion.start.Y);
-    add_to_shape(first[i], end, motion.end.Y);
-    add_to_shape(first[i], change, motion.change);
-    if (i > 2) continue;
-    put_side(i, start, motion.start.sides);
-    put_side(i, end, motion.end.sides);
-  }
+DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
+                                const BendingPoint* points,
+                                const double* x,
+                                Shape& shape) {
+  shape.Y = {};
+  for_sides(batch, points, x, [&](int i, const Lanes<3>& side) {
+    add_to_shape(points[batch.first + i], side, shape.Y);
+    if (i <= 2) put_side(i, side, shape.sides);
+  });
 }
 
 DIFFCLOTH_INLINE Polar polar_at(const BendingBatch& batch, const Lanes<6>& sides, int l) {
@@ -216,14 +189,36 @@ DIFFCLOTH_INLINE Polar polar_at(const BendingBatch& batch, const Lanes<6>& sides
   return polar_of(F);
 }
 
-DIFFCLOTH_INLINE Matrix rotation_of(const Polar& polar) {
-  Matrix R;
-  for (int k = 0; k < 3; ++k) {
-    R.column[0].at[k] = polar.r1[k];
-    R.column[1].at[k] = polar.r2[k];
-    R.column[2].at[k] = polar.n[k];
+DIFFCLOTH_INLINE void find_state(const BendingBatch& batch,
+                                 const Shape& shape,
+                                 BendingState& state) {
+  for (int l = 0; l < kLanes; ++l) {
+    const Polar polar = polar_at(batch, shape.sides, l);
+    for (int k = 0; k < 3; ++k) {
+      state.R[k][l] = polar.r1[k];
+      state.R[3 + k][l] = polar.r2[k];
+      state.R[6 + k][l] = polar.n[k];
+    }
+    state.S_inv[0][l] = polar.s11;
+    state.S_inv[1][l] = polar.s12;
+    state.S_inv[2][l] = polar.s22;
+    state.t[l] = polar.t;
+    for (int k = 0; k < 9; ++k) state.Y[k][l] = shape.Y.at[k][l];
   }
-  return R;
+}
+
+void evaluate(const BendingBatch* batches,
+              std::size_t count,
+              const BendingPoint* points,
+              const double* x,
+              BendingState* at) {
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch, ++at) {
+    Shape shape;
+    gather_at(*batch, points, x, shape);
+    BendingState state;  // known not to overlap the batch
+    find_state(*batch, shape, state);
+    *at = state;
+  }
 }
 
 /// Half the change of s : s Q, in world axes, for s with a start and a change.
@@ -281,20 +276,20 @@ struct Stresses {
 
 template <bool kCurved>
 DIFFCLOTH_INLINE void put_stresses(const BendingBatch& batch,
-                                   const Polar& polar,
-                                   const Matrix& R,
-                                   const Matrix& Y,
+                                   const BendingState& state,
                                    int l,
                                    Stresses& stresses) {
-  const Stress stress = stress_of<kCurved>(batch, R, Y, form_of(batch, l), l);
+  const Matrix R = matrix_at(state.R, l);
+  const Stress stress = stress_of<kCurved>(batch, R, matrix_at(state.Y, l), form_of(batch, l), l);
   const Matrix q = turned(R, sum(stress.q, stress.q_n));
   for (int a = 0; a < 3; ++a) put(q.column[a], a, l, stresses.Y.at);
-  const double in_plane = stress.tau.at[2] / polar.t;
-  const double out_1 = polar.s11 * stress.tau.at[1] - polar.s12 * stress.tau.at[0];
-  const double out_2 = polar.s12 * stress.tau.at[1] - polar.s22 * stress.tau.at[0];
+  const double (&S_inv)[3][kLanes] = state.S_inv;
+  const double in_plane = stress.tau.at[2] / state.t[l];
+  const double out_1 = S_inv[0][l] * stress.tau.at[1] - S_inv[1][l] * stress.tau.at[0];
+  const double out_2 = S_inv[1][l] * stress.tau.at[1] - S_inv[2][l] * stress.tau.at[0];
   for (int k = 0; k < 3; ++k) {
-    stresses.F.at[k][l] = out_1 * polar.n[k] - in_plane * polar.r2[k];
-    stresses.F.at[3 + k][l] = out_2 * polar.n[k] + in_plane * polar.r1[k];
+    stresses.F.at[k][l] = out_1 * R.column[2].at[k] - in_plane * R.column[1].at[k];
+    stresses.F.at[3 + k][l] = out_2 * R.column[2].at[k] + in_plane * R.column[0].at[k];
   }
 }
 
@@ -331,41 +326,37 @@ DIFFCLOTH_INLINE void add_forces(const BendingBatch& batch,
 
 template <bool kCurved>
 DIFFCLOTH_INLINE void find_stresses(const BendingBatch& batch,
-                                    const Shape& shape,
+                                    const BendingState& state,
                                     Stresses& stresses) {
-  for (int l = 0; l < kLanes; ++l) {
-    const Polar polar = polar_at(batch, shape.sides, l);
-    put_stresses<kCurved>(batch, polar, rotation_of(polar), matrix_at(shape.Y.at, l), l, stresses);
-  }
+  for (int l = 0; l < kLanes; ++l) put_stresses<kCurved>(batch, state, l, stresses);
 }
 
 void add_gradient(const BendingBatch* batches,
                   std::size_t count,
                   const BendingPoint* points,
-                  const double* x,
+                  const BendingState* at,
                   double* g) {
-  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
-    Shape shape;
-    gather_at(*batch, points, x, shape);
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch, ++at) {
     Stresses stresses;
-    with_curved(*batch, [&]<bool kCurved> { find_stresses<kCurved>(*batch, shape, stresses); });
+    with_curved(*batch, [&]<bool kCurved> { find_stresses<kCurved>(*batch, *at, stresses); });
     add_forces(*batch, points, stresses, g);
   }
 }
 
-/// Changes of energy of eight elements, and the stresses at the end of the motion.
+/// Changes of energy of eight elements.
+///
+/// @param change  of Y, summed from displacements
 template <bool kCurved>
 DIFFCLOTH_INLINE void find_changes(const BendingBatch& batch,
-                                   const BendingMotion& motion,
-                                   double (&energy)[kLanes],
-                                   Stresses& stresses) {
+                                   const BendingState& start,
+                                   const BendingState& end,
+                                   const Lanes<9>& change,
+                                   double (&energy)[kLanes]) {
   for (int l = 0; l < kLanes; ++l) {
-    const Matrix R0 = rotation_of(polar_at(batch, motion.start.sides, l));
-    const Polar polar = polar_at(batch, motion.end.sides, l);
-    const Matrix R1 = rotation_of(polar);
-    const Matrix dR = difference(R1, R0);
-    const Matrix Y0 = matrix_at(motion.start.Y.at, l);
-    const Matrix dY = matrix_at(motion.change.at, l);
+    const Matrix R0 = matrix_at(start.R, l);
+    const Matrix dR = difference(matrix_at(end.R, l), R0);
+    const Matrix Y0 = matrix_at(start.Y, l);
+    const Matrix dY = matrix_at(change.at, l);
     const Form Q = form_of(batch, l);
     double rest;
     if constexpr (kCurved) {
@@ -375,24 +366,34 @@ DIFFCLOTH_INLINE void find_changes(const BendingBatch& batch,
     }
     const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch.b_n, l), Q);
     energy[l] = rest + batch.damping[l] * damped;
-    put_stresses<kCurved>(batch, polar, R1, matrix_at(motion.end.Y.at, l), l, stresses);
   }
 }
 
 double energy_change(const BendingBatch* batches,
                      std::size_t count,
                      const BendingPoint* points,
-                     const double* x0,
                      const double* x1,
+                     const double* dx,
+                     const BendingState* start,
+                     BendingState* end,
                      double* g1) {
   double total = 0.0;
-  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
-    BendingMotion motion;
-    gather_motion(*batch, points, x0, x1, motion);
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch, ++start, ++end) {
+    Shape shape;
+    gather_at(*batch, points, x1, shape);
+    Lanes<9> change = {};
+    for_sides(*batch, points, dx, [&](int i, const Lanes<3>& side) {
+      add_to_shape(points[batch->first + i], side, change);
+    });
+    BendingState state;
+    find_state(*batch, shape, state);
+    *end = state;
     alignas(64) double energy[kLanes];
     Stresses stresses;
-    with_curved(*batch,
-                [&]<bool kCurved> { find_changes<kCurved>(*batch, motion, energy, stresses); });
+    with_curved(*batch, [&]<bool kCurved> {
+      find_changes<kCurved>(*batch, *start, state, change, energy);
+      if (g1 != nullptr) find_stresses<kCurved>(*batch, state, stresses);
+    });
     if (g1 != nullptr) add_forces(*batch, points, stresses, g1);
     for (int l = 0; l < batch->size; ++l) total += energy[l];
   }
@@ -417,15 +418,17 @@ struct Parts {
 
 template <bool kCurved>
 DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
-                                 const Shape& shape,
+                                 const BendingState& state,
                                  bool positive,
                                  Parts& parts) {
   const double exact = positive ? 0.0 : 1.0;
   for (int l = 0; l < kLanes; ++l) {
-    const Polar polar = polar_at(batch, shape.sides, l);
-    const Matrix R = rotation_of(polar);
+    const Matrix R = matrix_at(state.R, l);
+    const double s11 = state.S_inv[0][l];
+    const double s12 = state.S_inv[1][l];
+    const double s22 = state.S_inv[2][l];
     const Form Q = form_of(batch, l);
-    const Stress stress = stress_of<kCurved>(batch, R, matrix_at(shape.Y.at, l), Q, l);
+    const Stress stress = stress_of<kCurved>(batch, R, matrix_at(state.Y, l), Q, l);
     const Matrix b_n = matrix_at(batch.b_n, l);
     const Matrix of_start = times_form(batch.damping[l], b_n, Q);
     Matrix b;
@@ -465,15 +468,15 @@ DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
       for (int i = 0; i < 3; ++i) parts.C.at[3 * j + i][l] = (i == j ? trace : 0.0) - M[i][j];
     }
     const Vector& tau = stress.tau;
-    const double inv_t = 1.0 / polar.t;
+    const double inv_t = 1.0 / state.t[l];
     parts.inv_t.at[0][l] = inv_t;
     parts.in_plane.at[0][l] = tau.at[2] * inv_t;
     const double g[3][2] = {{-(batch.g[0][l] + batch.g[2][l]), -(batch.g[1][l] + batch.g[3][l])},
                             {batch.g[0][l], batch.g[1][l]},
                             {batch.g[2][l], batch.g[3][l]}};
     for (int p = 0; p < 3; ++p) {
-      const double h_u = polar.s11 * g[p][0] + polar.s12 * g[p][1];
-      const double h_v = polar.s12 * g[p][0] + polar.s22 * g[p][1];
+      const double h_u = s11 * g[p][0] + s12 * g[p][1];
+      const double h_v = s12 * g[p][0] + s22 * g[p][1];
       parts.g.at[2 * p][l] = g[p][0];
       parts.g.at[2 * p + 1][l] = g[p][1];
       parts.h.at[2 * p][l] = h_u;
@@ -481,8 +484,10 @@ DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
       parts.gamma.at[p][l] = h_v * tau.at[0] - h_u * tau.at[1];
       parts.eta.at[p][l] = h_u * tau.at[0] + h_v * tau.at[1];
       for (int k = 0; k < 3; ++k) {
-        parts.alpha.at[3 * p + k][l] = h_v * polar.r1[k] - h_u * polar.r2[k];
-        parts.epsilon.at[3 * p + k][l] = (g[p][0] * polar.r2[k] - g[p][1] * polar.r1[k]) * inv_t;
+        const double r1 = R.column[0].at[k];
+        const double r2 = R.column[1].at[k];
+        parts.alpha.at[3 * p + k][l] = h_v * r1 - h_u * r2;
+        parts.epsilon.at[3 * p + k][l] = (g[p][0] * r2 - g[p][1] * r1) * inv_t;
       }
     }
   }
@@ -634,15 +639,13 @@ DIFFCLOTH_INLINE void scatter(const BendingPoint& point,
 void add_hessian(const BendingBatch* batches,
                  std::size_t count,
                  const BendingPoint* points,
-                 const double* x,
+                 const BendingState* at,
                  bool positive,
                  const std::int32_t* place,
                  double* blocks) {
-  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
-    Shape shape;
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch, ++at) {
     Parts parts;
-    gather_at(*batch, points, x, shape);
-    with_curved(*batch, [&]<bool kCurved> { find_parts<kCurved>(*batch, shape, positive, parts); });
+    with_curved(*batch, [&]<bool kCurved> { find_parts<kCurved>(*batch, *at, positive, parts); });
     const BendingPoint* const first = points + batch->first;
     alignas(64) Block outer[3] = {};
     for (int i = 3; i < batch->points; ++i) {
@@ -668,8 +671,10 @@ void add_hessian(const BendingBatch* batches,
   }
 }
 
-constexpr BendingKernels kKernels{
-    .energy_change = energy_change, .add_gradient = add_gradient, .add_hessian = add_hessian};
+constexpr BendingKernels kKernels{.evaluate = evaluate,
+                                  .energy_change = energy_change,
+                                  .add_gradient = add_gradient,
+                                  .add_hessian = add_hessian};
 
 }  // namespace
 }  // namespace diffcloth::elastic

@@ -283,34 +283,48 @@ double bending_energy(const Model& model, const double* x) {
   return total;
 }
 
-double energy_change(const Model& model, const double* x0, const double* x1, double* g1) {
+BendingStates bending_states(const Model& model, const double* x) {
+  const BendingBatches& bent = model.prepared->bent;
+  BendingStates states(bent.batches.size());
+  bending_here().evaluate(bent.batches.data(), bent.batches.size(), bent.points.data(), x,
+                          states.data());
+  return states;
+}
+
+double energy_change(const Model& model,
+                     const double* x0,
+                     const double* x1,
+                     const double* dx,
+                     const BendingStates& start,
+                     BendingStates& end,
+                     double* g1) {
   const Prepared& prepared = *model.prepared;
   double total =
       stretch_kernels().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1, g1);
   total +=
       stretch_kernels().woven_energy_change(prepared.woven.data(), prepared.woven.size(), x0, x1);
-  if (g1 != nullptr) {
-    stretch_kernels().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x1, g1);
-  }
+  stretch_kernels().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x1, g1);
   total += stretch_kernels().damping_energy_change(prepared.damping_of_stretch.data(),
                                                    prepared.damping_of_stretch.size(), x0, x1, g1);
+  end.resize(prepared.bent.batches.size());
   total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
-                                        prepared.bent.points.data(), x0, x1, g1);
+                                        prepared.bent.points.data(), x1, dx, start.data(),
+                                        end.data(), g1);
   for_stiff_elements(model, [&](const bending::Element& element) {
     total += bending::flat_energy_change(element, x0, x1);
-    if (g1 != nullptr) bending::add_flat_gradient(element, x1, g1);
+    bending::add_flat_gradient(element, x1, g1);
   });
   return total;
 }
 
-void add_gradient(const Model& model, const double* x, double* g) {
+void add_gradient(const Model& model, const double* x, const BendingStates& at, double* g) {
   const Prepared& prepared = *model.prepared;
   stretch_kernels().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
   stretch_kernels().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x, g);
   stretch_kernels().add_damping_gradient(prepared.damping_of_stretch.data(),
                                          prepared.damping_of_stretch.size(), x, g);
   bending_here().add_gradient(prepared.bent.batches.data(), prepared.bent.batches.size(),
-                              prepared.bent.points.data(), x, g);
+                              prepared.bent.points.data(), at.data(), g);
   for_stiff_elements(
       model, [&](const bending::Element& element) { bending::add_flat_gradient(element, x, g); });
 }
@@ -318,6 +332,7 @@ void add_gradient(const Model& model, const double* x, double* g) {
 void add_hessian(const Model& model,
                  const Slots& slots,
                  const double* x,
+                 const BendingStates& at,
                  Curvature curvature,
                  const std::vector<Index>& place,
                  double* blocks) {
@@ -338,7 +353,8 @@ void add_hessian(const Model& model,
                                         prepared.damping_of_stretch.size(), x, positive,
                                         place.data(), blocks);
   bending_here().add_hessian(prepared.bent.batches.data(), prepared.bent.batches.size(),
-                             prepared.bent.points.data(), x, positive, place.data(), blocks);
+                             prepared.bent.points.data(), at.data(), positive, place.data(),
+                             blocks);
 }
 
 std::vector<Mat2> extrapolated_stresses(const Model& model, const double* x, const double* to) {

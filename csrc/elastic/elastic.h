@@ -133,24 +133,43 @@ inline double energy(const Model& model, const double* x) {
   return stretch_energy(model, x) + bending_energy(model, x);
 }
 
+/// States of the batches of elements that are not flat, at one point.
+using BendingStates = std::vector<BendingState>;
+
+/// States at x.
+BendingStates bending_states(const Model& model, const double* x);
+
 // The functions below leave out the flat elements of bending if `prepared.by_matrix`: the energy of
 // these elements is the quadratic form of their matrix. See ConstantForm::of_flat_bending().
 
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].
 ///
-/// @param g1  += grad E(x1), with the bits of add_gradient(); null for none
-double energy_change(const Model& model, const double* x0, const double* x1, double* g1 = nullptr);
+/// @param dx     x1 - x0
+/// @param start  states at x0
+/// @param end    set to the states at x1
+/// @param g1     += grad E(x1), with the bits of add_gradient()
+double energy_change(const Model& model,
+                     const double* x0,
+                     const double* x1,
+                     const double* dx,
+                     const BendingStates& start,
+                     BendingStates& end,
+                     double* g1);
 
 /// g += grad E(x), damping included, [N, 3] [N].
-void add_gradient(const Model& model, const double* x, double* g);
+///
+/// @param at  states at x
+void add_gradient(const Model& model, const double* x, const BendingStates& at, double* g);
 
 /// blocks += the Hessian at x, damping and flat elements included [N/m].
 ///
+/// @param at     states at x
 /// @param place  [slots] index of each slot in blocks, 9 doubles each
 void add_hessian(const Model& model,
                  const Slots& slots,
                  const double* x,
+                 const BendingStates& at,
                  Curvature curvature,
                  const std::vector<Index>& place,
                  double* blocks);

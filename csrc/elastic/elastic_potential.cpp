@@ -26,13 +26,32 @@ ElasticPotential::ElasticPotential(const Model& model,
 void ElasticPotential::renew() {
   flat_bending_ = ConstantForm::of_flat_bending(model_, flat_bending_.pattern());
   trial_ = {};
+  known_ = {};
+}
+
+const BendingStates& ElasticPotential::bent_at(const double* x) const {
+  const auto is_at = [&](const Known& known) {
+    return !known.x.empty() && std::equal(known.x.begin(), known.x.end(), x);
+  };
+  if (model_.prepared->bent.batches.empty()) return known_[last_].bent;
+  if (is_at(known_[last_])) return known_[last_].bent;
+  last_ = 1 - last_;
+  Known& here = known_[last_];
+  if (is_at(here)) return here.bent;
+  here.x.assign(x, x + change_.size());
+  here.bent = bending_states(model_, x);
+  return here.bent;
 }
 
 double ElasticPotential::energy_change(const double* x, const double* to) const {
   for (std::size_t a = 0; a < change_.size(); ++a) change_[a] = to[a] - x[a];
   trial_.x.assign(to, to + change_.size());
   trial_.gradient.assign(change_.size(), 0.0);
-  double change = elastic::energy_change(model_, x, to, trial_.gradient.data());
+  const BendingStates& start = bent_at(x);
+  Known& end = known_[1 - last_];
+  end.x = trial_.x;
+  double change = elastic::energy_change(model_, x, to, change_.data(), start, end.bent,
+                                         trial_.gradient.data());
   if (model_.prepared->by_matrix) {
     change += flat_bending_.energy_change(x, change_.data());
     flat_bending_.add_product(to, trial_.gradient.data());
@@ -44,7 +63,7 @@ void ElasticPotential::add_gradient(const double* x, double* g) const {
   if (trial_.x.empty() || !std::equal(trial_.x.begin(), trial_.x.end(), x)) {
     trial_.x.assign(x, x + change_.size());
     trial_.gradient.assign(change_.size(), 0.0);
-    elastic::add_gradient(model_, x, trial_.gradient.data());
+    elastic::add_gradient(model_, x, bent_at(x), trial_.gradient.data());
     if (model_.prepared->by_matrix) flat_bending_.add_product(x, trial_.gradient.data());
   }
   for (std::size_t a = 0; a < change_.size(); ++a) g[a] += trial_.gradient[a];
@@ -53,7 +72,7 @@ void ElasticPotential::add_gradient(const double* x, double* g) const {
 void ElasticPotential::add_hessian(const double* x,
                                    Curvature curvature,
                                    linalg::BlockMatrix& A) const {
-  elastic::add_hessian(model_, slots_, x, curvature, A.slot_of_base(), A.blocks());
+  elastic::add_hessian(model_, slots_, x, bent_at(x), curvature, A.slot_of_base(), A.blocks());
 }
 
 void ElasticPotential::add_extrapolation(const double* x,

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
 #include <utility>
 #include <vector>
@@ -80,6 +82,17 @@ class ElasticPotential final : public Potential {
   Wanted wanted_;
   ConstantForm flat_bending_;
   mutable std::vector<double> change_;  ///< scratch
+
+  /// States of bending at one point.
+  struct Known {
+    std::vector<double> x;  ///< positions of the vertices; empty if nothing is known
+    BendingStates bent;
+  };
+  /// States at x, which are kept until two other points are evaluated.
+  const BendingStates& bent_at(const double* x) const;
+
+  mutable std::array<Known, 2> known_;
+  mutable std::size_t last_ = 0;  ///< index of the point that was asked for last
 
   /// Last point at which energy and gradient were evaluated: often the next iterate.
   struct Trial {

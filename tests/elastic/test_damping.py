@@ -84,9 +84,10 @@ def test_damping_without_a_time_step_is_refused():
 
 @pytest.mark.parametrize("bending_model", MODELS)
 @pytest.mark.parametrize("positive", [False, True])
-def test_instructions_do_not_change_a_bit(positive, bending_model):
-    """Bent at rest, degenerate; with batches that are not full."""
-    X, faces = rests(True)
+@pytest.mark.parametrize("curved", [False, True])
+def test_instructions_do_not_change_a_bit(curved, positive, bending_model):
+    """Flat or bent at rest, degenerate; with batches that are not full."""
+    X, faces = rests(curved)
     x_n = X + 0.1 * RNG.normal(size=X.shape)
     x0 = x_n + 0.1 * RNG.normal(size=X.shape)
     x0[1] = x0[0]
@@ -102,3 +103,15 @@ def test_instructions_do_not_change_a_bit(positive, bending_model):
             assert change == results[0][0]
             np.testing.assert_array_equal(gradient, results[0][1])
             np.testing.assert_array_equal(blocks, results[0][2])
+
+
+@pytest.mark.parametrize("bending_model", MODELS)
+@pytest.mark.parametrize("curved", [False, True])
+def test_kept_evaluations_have_the_bits_of_new_ones(curved, bending_model):
+    X, faces = rests(curved)
+    x_n = X + 0.1 * RNG.normal(size=X.shape)
+    points = [x_n + 0.1 * RNG.normal(size=X.shape) for _ in range(3)]
+    damped = model(X, faces, bending_model, damping=DAMPING, x_n=x_n, **PARAMETERS)
+    np.testing.assert_array_equal(
+        damped.evaluations(*points, False), damped.evaluations(*points, True)
+    )

@@ -179,8 +179,9 @@ class Elastic {
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
     const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
-    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, own_places(),
-                         blocks.data());
+    const std::vector<double> at = positions("x", x);
+    elastic::add_hessian(model_, slots_, at.data(), elastic::bending_states(model_, at.data()),
+                         curvature, own_places(), blocks.data());
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 
@@ -252,12 +253,18 @@ class Elastic {
     const std::vector<double> to = positions("x1", x1);
     std::vector<double> g(from.size(), 0.0);
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
-    kernels.add_gradient(batches.data(), batches.size(), points.data(), from.data(), g.data());
-    kernels.add_hessian(batches.data(), batches.size(), points.data(), from.data(), positive,
+    std::vector<double> dx(from.size());
+    for (std::size_t a = 0; a < dx.size(); ++a) dx[a] = to[a] - from[a];
+    elastic::BendingStates start(batches.size());
+    elastic::BendingStates end(batches.size());
+    kernels.evaluate(batches.data(), batches.size(), points.data(), from.data(), start.data());
+    kernels.add_gradient(batches.data(), batches.size(), points.data(), start.data(), g.data());
+    kernels.add_hessian(batches.data(), batches.size(), points.data(), start.data(), positive,
                         own_places().data(), blocks.data());
-    return nb::make_tuple(kernels.energy_change(batches.data(), batches.size(), points.data(),
-                                                from.data(), to.data(), nullptr),
-                          rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
+    return nb::make_tuple(
+        kernels.energy_change(batches.data(), batches.size(), points.data(), to.data(), dx.data(),
+                              start.data(), end.data(), nullptr),
+        rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
   /// (row, column) of every block, in the order of hessian_blocks().
@@ -278,7 +285,8 @@ class Elastic {
     const std::vector<double> from = positions("x0", x0);
     const std::vector<double> to = positions("x", x);
     std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
-    elastic::add_hessian(model_, slots_, to.data(), curvature, own_places(), blocks.data());
+    elastic::add_hessian(model_, slots_, to.data(), elastic::bending_states(model_, to.data()),
+                         curvature, own_places(), blocks.data());
     elastic::add_extrapolation(model_, slots_, to.data(),
                                elastic::extrapolated_stresses(model_, from.data(), to.data()),
                                curvature, own_places(), blocks.data());
@@ -426,6 +434,30 @@ class Elastic {
     return potential_.emplace(model_, slots_, pattern_, elastic::Wanted::kNone);
   }
 
+  /// Changes of energy, gradients and Hessians as a solve asks for them, which returns to points that it
+  /// left: numbers of one potential, or of a new one for each evaluation.
+  Array evaluations(const Positions& x0, const Positions& x1, const Positions& x2, bool fresh) {
+    const std::array points{positions("x0", x0), positions("x1", x1), positions("x2", x2)};
+    std::vector<double> numbers;
+    const auto own = [&]() -> Potential& {
+      return fresh || !potential_ ? between(nullptr, nullptr) : *potential_;
+    };
+    between(nullptr, nullptr);
+    for (const auto& [from, to] : {std::pair{0, 1}, {0, 2}, {2, 1}, {2, 0}, {1, 2}}) {
+      const std::vector<double>& x = points[from];
+      const std::vector<double>& end = points[to];
+      numbers.push_back(own().energy_change(x.data(), end.data()));
+      for (const std::vector<double>* at : {&points[1], &end, &x}) {
+        std::vector<double> g(at->size(), 0.0);
+        own().add_gradient(at->data(), g.data());
+        numbers.insert(numbers.end(), g.begin(), g.end());
+        const Eigen::MatrixXd h = dense_hessian(own(), pattern_, at->data(), Curvature::kExact);
+        numbers.insert(numbers.end(), h.data(), h.data() + h.size());
+      }
+    }
+    return vector_array(numbers);
+  }
+
  private:
   static Index vertex_count(const Positions& X,
                             const Faces& faces,
@@ -571,6 +603,7 @@ void elastic_kernels(nb::module_& m) {
            "positive"_a = false)
       .def("chords", &Elastic::chords, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "shift"_a.noconvert(), "center"_a.noconvert())
+      .def("evaluations", &Elastic::evaluations, "x0"_a, "x1"_a, "x2"_a, "fresh"_a)
       .def("bending", &Elastic::bending, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "positive"_a = false)
       .def("extrapolated_hessian", &Elastic::extrapolated_hessian, "x0"_a.noconvert(),
