@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <type_traits>
 
 #include "contact/distance/mollifier.h"
 
@@ -97,6 +98,21 @@ std::array<Vec3, 2> sum(const std::array<Vec3, 2>& a, const std::array<Vec3, 2>&
 /// Matrix of v -> u x v.
 Mat3 cross_matrix(const Vec3& u) {
   return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
+}
+
+const FrictionKernels& kernels() {
+  static const FrictionKernels& best = friction_kernels(linalg::chosen_level());
+  return best;
+}
+
+static_assert(sizeof(Frame) == 9 * sizeof(double));
+static_assert(sizeof(FrictionSet::Slip) == SlipLayout::kSize * sizeof(double));
+
+/// The numbers of vectors or slips, one after the other.
+template <class Values>
+auto numbers(Values& values) {
+  using Number = std::conditional_t<std::is_const_v<Values>, const double, double>;
+  return reinterpret_cast<Number*>(values.data());
 }
 
 /// Point of the segment from a to b that is nearest to the origin.
@@ -234,6 +250,49 @@ FrictionSet::FrictionSet(const ContactModel& model,
   for (Index v = 0; v <= last; ++v) {
     if (takes_part[v] != 0) points_.push_back(v);
   }
+  take_place(x_start, start_);
+  make_batches();
+}
+
+void FrictionSet::make_batches() {
+  std::vector<std::int32_t> own(points_.empty() ? 0 : points_.back() + std::size_t{1});
+  for (std::size_t i = 0; i < points_.size(); ++i) own[points_[i]] = static_cast<std::int32_t>(i);
+  const auto put = [&](std::size_t e, int l, FrictionBatch& batch) {
+    const Entry& k = entries_[e];
+    const GapPart& part = k.parts[0];
+    const Vec3 e1_start = k.edge(part, 0, x_start_);
+    batch.entry[l] = static_cast<std::int32_t>(e);
+    for (int i = 0; i < kFrictionPoints; ++i) {
+      const bool exists = i < k.count;
+      batch.point[i][l] = own[k.points[exists ? i : 0]];
+      batch.c[i][l] = exists ? k.c[i] : 0.0;
+    }
+    for (int i = 0; i < 4; ++i) batch.edge[i][l] = own[k.points[part.edges[i]]];
+    for (int i = 0; i < 3; ++i) {
+      batch.a[i][l] = part.a[i];
+      batch.e1_start[i][l] = e1_start[i];
+      batch.n[i][l] = k.n[i];
+      batch.s_start[i][l] = k.s_start[i];
+      batch.w_start[i][l] = k.w_start[i];
+    }
+  };
+  batches_.reserve(entries_.size() / kFrictionLanes + 1);
+  for (std::size_t e = 0; e < entries_.size(); ++e) {
+    if (entries_[e].part_count != 1) {
+      alone_.push_back(e);
+      continue;
+    }
+    if (batches_.empty() || batches_.back().size == kFrictionLanes) batches_.emplace_back();
+    FrictionBatch& batch = batches_.back();
+    batch.points = std::max(batch.points, entries_[e].count);
+    put(e, batch.size++, batch);
+  }
+  if (batches_.empty()) return;
+  FrictionBatch& last = batches_.back();
+  const std::int32_t repeated = last.entry[last.size - 1];
+  for (int l = last.size; l < kFrictionLanes; ++l) {
+    put(static_cast<std::size_t>(repeated), l, last);
+  }
 }
 
 bool FrictionSet::is_at(const std::vector<Vec3>& place, const double* x) const {
@@ -253,10 +312,41 @@ const FrictionSet::Slips& FrictionSet::slips(const double* x) const {
   Kept& here = kept_[last_];
   if (is_at(here.place, x)) return here.slips;
   take_place(x, here.place);
-  here.slips.clear();
-  here.slips.reserve(entries_.size());
-  for (const Entry& k : entries_) here.slips.push_back(slip(k, x));
+  find_slips(x, here.place, kernels(), here.slips);
   return here.slips;
+}
+
+FrictionSet::Slips FrictionSet::slips(const double* x, const FrictionKernels& by) const {
+  std::vector<Vec3> place;
+  take_place(x, place);
+  Slips result;
+  find_slips(x, place, by, result);
+  return result;
+}
+
+void FrictionSet::find_slips(const double* x,
+                             const std::vector<Vec3>& place,
+                             const FrictionKernels& by,
+                             Slips& out) const {
+  out.resize(entries_.size());
+  std::vector<Vec3> delta(points_.size());
+  for (std::size_t i = 0; i < delta.size(); ++i) delta[i] = place[i] - start_[i];
+  by.find_slips(batches_.data(), batches_.size(), numbers(place), numbers(delta),
+                model_->parameters().slip, numbers(out));
+  for (const std::size_t e : alone_) out[e] = slip(entries_[e], x);
+}
+
+std::vector<Vec3> FrictionSet::changes(const Slips& at,
+                                       const double* p,
+                                       const FrictionKernels& by) const {
+  std::vector<Vec3> motion;
+  take_place(p, motion);
+  std::vector<Vec3> result(entries_.size());
+  by.find_changes(batches_.data(), batches_.size(), numbers(motion), numbers(at), numbers(result));
+  for (const std::size_t e : alone_) {
+    result[e] = tangential(change_of_slip(entries_[e], at[e].frames, p), entries_[e].n);
+  }
+  return result;
 }
 
 FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
@@ -344,13 +434,14 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
   const Slips& end = slips(to);
   const Slips& start = slips(x);  // both are cached
   const bool go_on = has_duals(x);
+  const std::vector<Vec3> change = changes(start, p, kernels());
   std::vector<Vec3> duals(entries_.size());
   bool any = false;
   for (std::size_t i = 0; i < entries_.size(); ++i) {
     const FrictionLaw& law = start[i].law;
     const Vec3& w = start[i].w;
     const Vec3 v = go_on ? duals_[i] : start[i].force();
-    const Vec3 dw = tangential(change_of_slip(entries_[i], start[i].frames, p), entries_[i].n);
+    const Vec3& dw = change[i];
     const Vec3 linear =
         stiffness(i, start[i]) * (w + dw) + (law.f2 / law.f1_over_y * w.dot(dw)) * v;
     duals[i] = v + std::min(alpha, 1.0) * (linear - v);
@@ -367,10 +458,10 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
 
 double FrictionSet::force_change(const double* x, const double* p) const {
   const Slips& here = slips(x);
+  const std::vector<Vec3> change = changes(here, p, kernels());
   double largest = 0.0;
   for (std::size_t i = 0; i < entries_.size(); ++i) {
-    const Vec3 dw = tangential(change_of_slip(entries_[i], here[i].frames, p), entries_[i].n);
-    largest = std::max(largest, here[i].law.f1_over_y * dw.norm());
+    largest = std::max(largest, here[i].law.f1_over_y * change[i].norm());
   }
   return largest;
 }

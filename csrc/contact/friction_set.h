@@ -8,6 +8,7 @@
 #include "common/friction_law.h"
 #include "contact/contact_set.h"
 #include "contact/direction_kernels.h"
+#include "contact/friction_lanes.h"
 
 namespace diffcloth::contact {
 
@@ -158,6 +159,17 @@ class FrictionSet {
   /// Slips at x; the reference is valid until slips at two other points are computed.
   const Slips& slips(const double* x) const;
 
+  /// Slips at x by given kernels, which are not kept.
+  Slips slips(const double* x, const FrictionKernels& by) const;
+
+  /// Slip of one entry at x: the same bits, one operation after the other.
+  Slip slip(const Entry& entry, const double* x) const;
+
+  /// Changes of w of all entries with a small motion p of all points.
+  ///
+  /// @param at  slips at the start of the motion
+  std::vector<Vec3> changes(const Slips& at, const double* p, const FrictionKernels& by) const;
+
   double energy_change(const double* x0, const double* x1) const;
   void add_gradient(const double* x, double* g) const;
   /// Add the gradient of one entry, which has this slip.
@@ -272,7 +284,11 @@ class FrictionSet {
   ExtensionDerivative extension_derivative(const Entry& entry) const;
   bool is_at(const std::vector<Vec3>& place, const double* x) const;
   void take_place(const double* x, std::vector<Vec3>& place) const;
-  Slip slip(const Entry& entry, const double* x) const;
+  void make_batches();
+  void find_slips(const double* x,
+                  const std::vector<Vec3>& place,
+                  const FrictionKernels& by,
+                  Slips& out) const;
   /// q of the Hessians other than kExact.
   double stiffness(std::size_t entry, const Slip& at) const;
 
@@ -281,11 +297,14 @@ class FrictionSet {
   const double* x_lag_ = nullptr;
   std::vector<Entry> entries_;
   mutable std::array<Kept, 2> kept_;
-  mutable std::size_t last_ = 0;  // index of the last entry used
-  std::vector<Index> points_;     // of all entries, ascending
-  std::vector<Vec3> duals_at_;    // positions of points_ for the duals; empty: no duals
-  std::vector<Vec3> duals_;       // of the entries
-  std::vector<double> expected_;  // q of the entries; empty: no expectation
+  mutable std::size_t last_ = 0;        // index of the last entry used
+  std::vector<Index> points_;           // of all entries, ascending
+  std::vector<Vec3> start_;             // their positions at x_start
+  std::vector<FrictionBatch> batches_;  // entries with one frame
+  std::vector<std::size_t> alone_;      // entries with two frames
+  std::vector<Vec3> duals_at_;          // positions of points_ for the duals; empty: no duals
+  std::vector<Vec3> duals_;             // of the entries
+  std::vector<double> expected_;        // q of the entries; empty: no expectation
 };
 
 }  // namespace diffcloth::contact

@@ -234,6 +234,26 @@ def test_friction_has_the_derivatives_of_its_energy(name, amount):
         np.testing.assert_allclose(h @ d.ravel(), product.ravel(), atol=1e-11 * scale)
 
 
+# At the start itself every displacement is exactly zero. Scenes have entries of all kinds, and
+# counts that are no multiples of the lanes.
+@pytest.mark.parametrize("amount", [0.0, 0.003, 0.05])
+@pytest.mark.parametrize("name", NAMES)
+def test_slips_in_lanes_are_those_of_single_entries(name, amount):
+    scene = contact_scenes.make(name)
+    start, x = moved(scene, amount), moved(scene, amount, 6 if amount else 5)
+    friction = scene.potential().friction(scene.x, start)
+    p = directions(x.shape, 1)[0]
+    alone = friction.slips(x, p, "")
+    assert len(alone) > 0
+    for level in kernels.kernel_levels():
+        found = friction.slips(x, p, level)
+        np.testing.assert_array_equal(found[:, :20], alone[:, :20])
+        # Changes by differences of 1e-6, whose error is 1e-10 over the step.
+        np.testing.assert_allclose(
+            found[:, 20:], alone[:, 20:], atol=1e-7 * np.abs(alone[:, 20:]).max()
+        )
+
+
 @pytest.mark.quick(
     "on_relief-0.003-0.0",
     "on_relief-0.003-1.6",

@@ -69,6 +69,37 @@ class Friction {
             dense_hessian(potential_, pattern_, to.data(), Curvature::kPrimalDual)};
   }
 
+  /// e1, e2, m, s, w, law and the change of w with a motion p, of each entry: by the kernels of a level,
+  /// or, if it is empty, one operation after the other with the change by differences.
+  Eigen::MatrixXd slips(const Positions& x, const Positions& p, const std::string& level) const {
+    const contact::FrictionSet& set = potential_.set();
+    contact::FrictionSet::Slips at;
+    std::vector<Vec3> change;
+    if (level.empty()) {
+      for (const contact::FrictionSet::Entry& k : set.entries()) {
+        at.push_back(set.slip(k, x.data()));
+        constexpr double kSmall = 1e-6;
+        const Rows3 after = x + kSmall * p;
+        const Rows3 before = x - kSmall * p;
+        change.emplace_back((set.slip(k, after.data()).w - set.slip(k, before.data()).w) /
+                            (2.0 * kSmall));
+      }
+    } else {
+      const contact::FrictionKernels& by = contact::friction_kernels(level_named(level));
+      at = set.slips(x.data(), by);
+      change = set.changes(at, p.data(), by);
+    }
+    Eigen::MatrixXd result(at.size(), 23);
+    for (std::size_t e = 0; e < at.size(); ++e) {
+      const FrictionLaw& law = at[e].law;
+      const contact::FrictionSet::Frame& frame = at[e].frames[0];
+      result.row(static_cast<Eigen::Index>(e)) << frame.e1.transpose(), frame.e2.transpose(),
+          frame.m.transpose(), at[e].s.transpose(), at[e].w.transpose(), law.f0, law.f1_over_y,
+          law.f2, law.f1_over_y_e, law.f0_e, change[e].transpose();
+    }
+    return result;
+  }
+
   /// At x, with an expected motion to another point: true if there are duals, and the primal-dual and
   /// the positive Hessian.
   std::tuple<bool, Eigen::MatrixXd, Eigen::MatrixXd> expecting(const Positions& x,
@@ -347,7 +378,8 @@ void contact_potentials(nb::module_& m) {
   nb::class_<Friction> friction(m, "Friction");
   bind_potential(friction);
   friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0)
-      .def("expecting", &Friction::expecting, "x"_a, "to"_a);
+      .def("expecting", &Friction::expecting, "x"_a, "to"_a)
+      .def("slips", &Friction::slips, "x"_a, "p"_a, "level"_a);
 
   nb::class_<ContactPotential> barrier(m, "ContactPotential");
   bind_potential(barrier);
