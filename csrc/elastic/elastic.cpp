@@ -197,7 +197,8 @@ void prepare(Model& model, const Slots& slots) {
     }
   }
   const double stiffest = prepared.constant.empty() ? 0.0 : std::ranges::max(prepared.constant);
-  prepared.by_matrix = stiffest <= kStiffest * model.least_inertia;
+  // A matrix of zeros, where no element is flat, would take as long as any other.
+  prepared.by_matrix = stiffest > 0.0 && stiffest <= kStiffest * model.least_inertia;
   prepared.identity = prepared.constant;
   for (const Index e : bent) {
     bending::Element element = bending_element(model, e);
