@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <tuple>
 
 #include "contact/distance/closest.h"
@@ -21,6 +22,10 @@ constexpr double kBorder = 1e-12;
 
 /// Squared distances that differ by this factor differ by more than rounding.
 constexpr double kClearly = 1.0 + 1e-12;
+
+/// Squared sine of an angle below which a triangle is a sliver, whose closest point closest_points()
+/// may place on an edge.
+constexpr double kThinnest = 1e-6;
 
 enum Kind : std::int8_t { kVertex, kEdge, kFace, kMollified };
 
@@ -109,9 +114,11 @@ Projection project(const CollisionMesh& mesh,
   return result;
 }
 
-/// True if the projection of a point lies inside a triangle and the point is farther than `range` from
-/// all edges: the interior then is the only feature within `range`.
-bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
+/// Squared distance of a point from a triangle that contains its projection, with the bits of
+/// closest_points(), if the point is farther than `range` from all edges: the interior then is the only
+/// feature within `range`.
+std::optional<double> far_inside(
+    const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
   const Vec3 e0 = b - a;
   const Vec3 e1 = c - a;
   const Vec3 w = p - a;
@@ -124,7 +131,11 @@ bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, d
   const auto is_clear = [&](double from_side, const Vec3& side) {
     return from_side > 0.0 && from_side * from_side > least * least * side.squaredNorm();
   };
-  return is_clear(b1, e0) && is_clear(b0, e1) && is_clear(n_sq - b0 - b1, e1 - e0);
+  if (!is_clear(b1, e0) || !is_clear(b0, e1) || !is_clear(n_sq - b0 - b1, e1 - e0)) return {};
+  const bool is_sliver = !(n_sq > kThinnest * e0.squaredNorm() * e1.squaredNorm());
+  if (is_sliver) return closest_points(PairKind::kPointTriangle, {p, a, b, c}).d_sq;
+  const Vec3 t = w - b0 / n_sq * e0 - b1 / n_sq * e1;
+  return t.squaredNorm();
 }
 
 bool is_beyond(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
@@ -446,10 +457,8 @@ void add_point_terms(const CollisionMesh& mesh,
   if (group.size() == 1 && features.counts[group.front().b] != 0) {
     const Candidate& pair = group.front();
     const auto& [self, i, j, k] = pair.vertices;
-    if (is_far_inside(p, row(x, i), row(x, j), row(x, k), range)) {
-      const double d_sq =
-          closest_points(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)}).d_sq;
-      if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = scale, .d_sq = d_sq});
+    if (const auto d_sq = far_inside(p, row(x, i), row(x, j), row(x, k), range)) {
+      if (*d_sq < range * range) out.push_back({.pair = pair, .coefficient = scale, .d_sq = *d_sq});
       return;
     }
   }
