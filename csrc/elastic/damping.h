@@ -41,9 +41,9 @@ inline Mat2 strain(const Mat32& F, const Mat32& F_n) {
 
 /// Likewise, with a prediction.
 inline Mat2 strain(const Mat32& F, const Start& start) {
-  const Mat2 since_start = strain(F, start.F_n);
-  if (start.ahead == 0.0) return since_start;
-  return since_start + start.ahead * strain(start.F_a, start.F_n);
+  Mat2 result = strain(F, start.F_n);
+  if (start.ahead != 0.0) result += start.ahead * strain(start.F_a, start.F_n);
+  return result;
 }
 
 /// Change of the strain along changes of F_n and F_a.
