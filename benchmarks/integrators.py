@@ -1,6 +1,6 @@
 """Compare the integrators: momentum, bias of fits by the time step, energy in contact, and cost.
 
-    python -m benchmarks.integrators              # all parts: about twenty minutes
+    python -m benchmarks.integrators              # all parts: about half an hour
     python -m benchmarks.integrators --part momentum --part drag
     python -m benchmarks.integrators --quick      # small forms of each part
 

@@ -70,7 +70,7 @@ ScalarBars constant_mixed(const Element& element,
                           const double* z,
                           double* c_bar);
 
-/// Where damping begins: the start of a step and, for steps of second order, a prediction of its end.
+/// Start of damping: the start of a step and, for steps of second order, a prediction of its end.
 struct Start {
   const double* x_n;    ///< [N, 3], or null without a start
   const double* ahead;  ///< [N, 3], or null without a prediction

@@ -35,7 +35,7 @@ struct BendingBatch {
   double b_n[9][kBendingLanes];   ///< likewise; zero without damping
 };
 
-/// The elements of a batch at one point: what every evaluation there begins with.
+/// State of the elements of a batch at one point, which all evaluations there share.
 struct BendingState {
   double R[9][kBendingLanes];      ///< rotation of the frame, column by column
   double S_inv[3][kBendingLanes];  ///< S^-1 of frame.h: 11, 12 and 22

@@ -23,10 +23,10 @@ namespace diffcloth::elastic::damping {
 /// so that E, with half the weight, resists the mean of the predicted rate (C_a - C_n) / h and the rate
 /// of the step.
 
-/// See above.
+/// Multiple of the predicted change of C in the strain of damping.
 inline constexpr double kAhead = 2.0;
 
-/// F where damping begins.
+/// Deformation gradients from which damping counts.
 struct Start {
   Mat32 F_n;
   Mat32 F_a;

@@ -111,7 +111,7 @@ inline bending::Element bending_element(const Model& model, Index e) {
           .flat = prepared.flat[e] != 0};
 }
 
-/// Where the damping of bending begins.
+/// Start of the damping of bending.
 inline bending::Start start_of(const Model& model) {
   return {.x_n = model.x_n, .ahead = model.ahead};
 }

@@ -25,17 +25,16 @@ Weave stretch_weave(const Model& model, Index f);
 /// Likewise for its damping.
 Weave damping_weave(const Model& model, Index f);
 
-/// Where the damping of a face begins; the model has a start of the step.
+/// Start of the damping of a face; the model has a start of the step.
 damping::Start damping_start(const Model& model, Index f);
 
-/// Likewise, the tangent.
+/// Tangent of damping_start().
 damping::Start damping_start_change(const Model& model,
                                     Index f,
                                     const Bar& dot,
                                     const Changing& changing);
 
-/// Add the cotangent of where the damping of a face begins to the cotangents of positions, and with
-/// `with_rest` to those of the rest shape.
+/// Pull a cotangent of damping_start() back to the positions and, if `with_rest`, to the rest shape.
 void add_damping_start(
     const Model& model, Index f, const damping::Start& start_bar, bool with_rest, Bar& bar);
 

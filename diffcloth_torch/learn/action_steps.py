@@ -25,7 +25,7 @@ ROLLOUTS_KEPT = 10
 """Number of former rollouts at whose observations a fit retains the actions."""
 
 _LARGEST_ACTION = 0.995  # moved actions are clipped to this, short of the ends of tanh
-_FORMER_SHARE = 2  # number of former observations in a step of the fit, over those of the rollout
+_FORMER_SHARE = 2  # ratio of former observations to new observations in a step of the fit
 
 
 def moved_actions(actions: Tensor, slopes: Tensor, step: float, largest: float) -> Tensor:

@@ -434,8 +434,8 @@ class Elastic {
     return potential_.emplace(model_, slots_, pattern_, elastic::Wanted::kNone);
   }
 
-  /// Changes of energy, gradients and Hessians as a solve asks for them, which returns to points that it
-  /// left: numbers of one potential, or of a new one for each evaluation.
+  /// Changes of energy, gradients and Hessians in the order of a solve that returns to earlier points:
+  /// numbers of one potential, or of a new potential for each evaluation.
   Array evaluations(const Positions& x0, const Positions& x1, const Positions& x2, bool fresh) {
     const std::array points{positions("x0", x0), positions("x1", x1), positions("x2", x2)};
     std::vector<double> numbers;

@@ -20,8 +20,8 @@ class Elasticity final : public StepPotential {
 
   const elastic::Model& model() const { return model_; }
 
-  /// Let damping resist the mean of a predicted rate and the rate of the step: see elastic/damping.h. The
-  /// time step of the model is twice the time step of the problem.
+  /// Set the prediction of a step of second order: damping then resists the mean of the predicted rate
+  /// and the rate of the step, see elastic/damping.h.
   ///
   /// @param end  prediction of the end of the step [N, 3] [m]; outlives this object
   void predict(const Problem& problem, const double* end);
