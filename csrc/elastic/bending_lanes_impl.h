@@ -358,12 +358,8 @@ DIFFCLOTH_INLINE void find_changes(const BendingBatch& batch,
     const Matrix Y0 = matrix_at(start.Y, l);
     const Matrix dY = matrix_at(change.at, l);
     const Form Q = form_of(batch, l);
-    double rest;
-    if constexpr (kCurved) {
-      rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch.b, l), Q);
-    } else {
-      rest = half_change(Y0, dY, Q);
-    }
+    const double rest =
+        kCurved ? change_of_term(Y0, dY, R0, dR, matrix_at(batch.b, l), Q) : half_change(Y0, dY, Q);
     const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch.b_n, l), Q);
     energy[l] = rest + batch.damping[l] * damped;
   }
