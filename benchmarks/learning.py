@@ -4,10 +4,10 @@
     python -m benchmarks.learning FoldCloth --method imitate --seed 0
     python -m benchmarks.learning --only-show --page docs/learning.md
 
-Each task, size, method, seed and budget is a line of JSON in the file of results; existing lines
-are not repeated, so an interrupted run continues. Rows that inform most come first: methods that
-learn nothing, imitation, then six methods that learn from rewards, all with the first seed; then
-other sizes and other seeds; plans at the end.
+Each task, size, method, seed and budget is a line of JSON in docs/learning_methods.jsonl. Existing
+lines are not repeated: a run continues where an earlier run ended, also on another machine. Rows
+that inform most come first: methods that learn nothing, imitation, then six methods that learn from
+rewards, all with the first seed; then other sizes and other seeds; plans at the end.
 
 `return` and `success` are means over the episodes, `interval` is the Wilson interval of the success
 at 95 %, `steps` the environment steps of learning, `minutes` its processor time. The success of
@@ -63,9 +63,16 @@ _FRESH = 10_000  # seed of the starts of evaluations
 )
 @click.option(
     "--results",
-    default="results/learning.jsonl",
+    default="docs/learning_methods.jsonl",
     show_default=True,
     type=click.Path(dir_okay=False, path_type=Path),
+)
+@click.option(
+    "--policies",
+    default="results/learning",
+    show_default=True,
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of policies of `imitate`, which `transfer` evaluates.",
 )
 @click.option(
     "--page",
@@ -84,6 +91,7 @@ def main(
     steps: int | None,
     others: Sequence[int],
     results: Path,
+    policies: Path,
     page: Path | None,
     only_show: bool,
 ) -> None:
@@ -92,7 +100,6 @@ def main(
     changed = {name: value for name, value in given.items() if value is not None}
     rows = read(results)
     have = {key_of(row) for row in rows}
-    policies = results.with_suffix("")
     work = jobs(tasks or tuple(envs.TASKS), methods, seeds, size, others, steps, changed, policies)
     for job in work:
         if only_show or job.key in have:

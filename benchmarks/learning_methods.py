@@ -17,12 +17,11 @@ Methods that learn from rewards use soft grasps, which have gradients, in tasks 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import torch
 
@@ -134,10 +133,15 @@ def _unlearned(job: Job, env: envs.ClothVectorEnv) -> Callable[[int], torch.Tens
 
 
 def _imitated(job: Job) -> Acts:
-    policy = imitate(job.make, "scripted", seed=job.seed, **(stage_of(job.task) | job.changed))
+    return _policy_acts(_imitation_of(job))
+
+
+def _imitation_of(job: Job) -> Policy:
+    make = replace(job, size=job.trained_at).make
+    policy = imitate(make, "scripted", seed=job.seed, **(stage_of(job.task) | job.changed))
     job.policies.mkdir(parents=True, exist_ok=True)
     policy.save(job.policy_file)
-    return _policy_acts(policy)
+    return policy
 
 
 def stage_of(task: str) -> dict[str, int]:
@@ -153,12 +157,9 @@ def stage_of(task: str) -> dict[str, int]:
 
 
 def _transferred(job: Job) -> Acts:
-    if not job.policy_file.exists():
-        raise click.ClickException(
-            f"transfer: {job.policy_file} must exist: run `--method imitate --size "
-            f"{job.trained_at} --seed {job.seed}` without its row in the results"
-        )
-    return _policy_acts(load_policy(job.policy_file))
+    """Read the policy of `imitate`; learn it where there is no file, with the same bits."""
+    exists = job.policy_file.exists()
+    return _policy_acts(load_policy(job.policy_file) if exists else _imitation_of(job))
 
 
 def _policy_acts(policy: Policy) -> Acts:

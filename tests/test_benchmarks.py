@@ -543,6 +543,7 @@ def test_rows_of_learning_are_made_once(tmp_path):
     learning = importlib.import_module("benchmarks.learning")
     file = tmp_path / "rows.jsonl"
     common = ["HitCloth", "--size", "4", "--episodes", "2", "--results", str(file)]
+    common += ["--policies", str(tmp_path / "policies")]
 
     def run(*arguments):
         result = CliRunner().invoke(learning.main, [*common, *arguments], catch_exceptions=False)
@@ -643,6 +644,9 @@ def test_learning_counts_its_steps(tmp_path):
     moved = row("transfer", size=5)
     assert moved["steps"] == 0
     assert row("transfer")["return"] == imitated["return"]  # the same policy
+    (tmp_path / "HitCloth-4-0.pt").unlink()
+    again = row("transfer", rounds=2, episodes=2, iterations=20)
+    assert (again["return"], again["steps"]) == (imitated["return"], imitated["steps"])
     assert row("plan", episodes=1, attempts=1, knots=2, iterations=1)["episodes"] == 1
     assert row("apg", budget=150)["steps"] == 2 * 4 * 36
     assert row("shac", budget=150)["steps"] == 3 * 4 * 18
