@@ -347,9 +347,8 @@ class _Job:
         return counts | {"return": value, "success": success}
 
     def _check(self) -> None:
-        """Check the last policy where the last update has not done so."""
-        if self.trainer.updates % self.trainer.options.check_every:
-            self.trainer.check()
+        """Check the last policy without tolerance."""
+        self.trainer.check()
 
     def _is_looked_at(self, evaluations: list[dict[str, Any]]) -> bool:
         """Return whether an evaluated policy is compared with the best one.

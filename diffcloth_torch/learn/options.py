@@ -115,8 +115,9 @@ class TrainerOptions(_RefusesOldNames):
             in the initial policy. None: 0.02 for a training that begins at a policy, otherwise no
             bound. Actions lie between -1 and 1, so 2 bounds no update.
         held_out: Number of starts, excluded from rollouts, at which the policy is checked initially
-            and after every `check_every` updates; if success has fallen, the last good policy is
-            restored. None: 16 for a training that begins at a policy, otherwise 0; 0: no checks.
+            and after every `check_every` updates. If success has fallen by more than two standard
+            errors, the last good policy is restored; `Trainer.check` restores it after any fall.
+            None: 16 for a training that begins at a policy, otherwise 0; 0: no checks.
         check_every: Updates from one check to the next.
         seed: Seed of networks, noise and starts.
 

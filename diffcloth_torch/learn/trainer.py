@@ -213,7 +213,7 @@ class Trainer:
         if o.draws and not self.steps:
             self._draw_plan()
         if self.held_out and self._kept is None:
-            self.check()
+            self._checked(final=False)
         rollouts = self._rollouts()
         rows = _Rows(rollouts)
         log = {"loss": sum(r.loss for r in rollouts)}
@@ -244,34 +244,38 @@ class Trainer:
         self.updates += 1
         log |= self._ended(rows)
         if self.held_out and self.updates % o.check_every == 0:
-            log |= self.check()
+            log |= self._checked(final=False)
         return log
 
     def check(self) -> dict[str, float]:
         """Evaluate the policy at the held-out starts; restore the last good policy if it is worse.
 
-        `update` calls this method after every `check_every` updates. Called after the last update
-        of a fine-tuning, it ensures that the final policy succeeds at these starts at least as
-        often as the initial policy.
+        Called after the last update of a fine-tuning, it ensures that the final policy succeeds at
+        these starts at least as often as the initial policy. `update` checks after every
+        `check_every` updates, and then tolerates a fall of the success by two standard errors,
+        which chance may cause.
 
         Returns:
             "held_out": the share of successes of the checked policy; "undone": 1 if an earlier
             policy with a larger share was restored. Empty without held-out starts.
         """
+        return self._checked(final=True)
+
+    def _checked(self, *, final: bool) -> dict[str, float]:
         if not self.held_out:
             return {}
         found = evaluate_starts(
             "Trainer.check", self._make_env, self.policy, self.held_out, workers=self._workers
         )
-        success, kept = found.success_rate, self._kept
-        undone = kept is not None and success < kept.success
-        if kept is not None and undone:
-            kept.restore(self.policy, self._actor_steps)
-            self.undone += 1
-        else:
+        success, kept, undone = found.success_rate, self._kept, False
+        if kept is None or success >= kept.success:
             weights = Kept.weights_of(self.policy)
             steps = copy.deepcopy(self._actor_steps.state_dict())
             self._kept = Kept(self.updates, success, weights, steps)
+        elif final or kept.success - success > kept.noise(len(self.held_out)):
+            kept.restore(self.policy, self._actor_steps)
+            self.undone += 1
+            undone = True
         return {"held_out": success, "undone": float(undone)}
 
     def evaluate(self, episodes: int = 8, seed: int = 0) -> tuple[float, float, list[State]]:

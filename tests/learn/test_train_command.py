@@ -154,11 +154,16 @@ def test_the_best_policy_is_kept_and_reported(config, tmp_path, looks):
 
 def test_the_last_policy_is_checked_at_held_out_starts(config, tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(Trainer, "check", lambda trainer: calls.append(trainer.updates) or {})
+
+    def checked(trainer, *, final):
+        calls.append((trainer.updates, final))
+        return {}
+
+    monkeypatch.setattr(Trainer, "_checked", checked)
     held_out = "trainer.held_out=2", "trainer.check_every=2", "updates=3", "viewers=[]"
     result = call(config, "--out", tmp_path / "out", *(f"--set={change}" for change in held_out))
     assert result.exit_code == 0, result.output
-    assert calls[-2:] == [2, 3]
+    assert calls[-2:] == [(2, False), (3, True)]
     assert len(record_of(tmp_path / "out")["starts"]["undo"]) == 2
 
 
