@@ -319,7 +319,7 @@ class _Job:
                     for name, value in scalars.items() if events else ():
                         events.add_scalar(name, value, trainer.steps)
                     if trainer.updates == self._updates:
-                        self._check()
+                        trainer.check()
                     is_last = trainer.updates == updates
                     if trainer.updates % section.evaluate_every and not is_last:
                         continue
@@ -345,10 +345,6 @@ class _Job:
         value, success, _ = self.trainer.evaluate(self.section.episodes)
         counts = {"updates": self.trainer.updates, "steps": self.trainer.steps}
         return counts | {"return": value, "success": success}
-
-    def _check(self) -> None:
-        """Check the last policy without tolerance."""
-        self.trainer.check()
 
     def _is_looked_at(self, evaluations: list[dict[str, Any]]) -> bool:
         """Return whether an evaluated policy is compared with the best one.
