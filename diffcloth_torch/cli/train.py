@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from diffcloth_torch.config.train_schema import (
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import imitation
-from diffcloth_torch.learn.evaluation import evaluate, follow
+from diffcloth_torch.learn.evaluation import evaluate, follow, noise_of_success
 from diffcloth_torch.learn.options import TrainerOptions, name_now
 from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.starts import PURPOSES, episode_seeds, purpose_seed
@@ -370,8 +370,7 @@ class _Job:
             workers=self._workers,
         )
         value = {"success": found.success_rate, "return": found.mean_return}
-        best = self._best
-        if best is None or tuple(value.values()) > (best["success"], best["return"]):
+        if self._best is None or _is_better(value, self._best, len(found)):
             weights = {name: t.clone() for name, t in trainer.policy.state_dict().items()}
             self._best = {"updates": trainer.updates, **value, "policy": weights}
 
@@ -456,6 +455,14 @@ class _Job:
                     record.show(state[0])
         if "web" in self.section.viewers:
             show(scene, states, out / f"{_VIDEO}.html", camera=camera)
+
+
+def _is_better(found: Mapping[str, Any], best: Mapping[str, Any], episodes: int) -> bool:
+    """Return whether a policy has more success, or, equal up to chance, a larger return."""
+    gain = found["success"] - best["success"]
+    if abs(gain) > noise_of_success(episodes, found["success"], best["success"]):
+        return bool(gain > 0)
+    return bool(found["return"] > best["return"])
 
 
 def _options(section: TrainConfig) -> dict[str, Any]:

@@ -35,6 +35,7 @@ __all__ = [
     "evaluate",
     "evaluate_starts",
     "follow",
+    "noise_of_success",
     "seeds_of",
     "steps_of",
     "wilson",
@@ -49,6 +50,7 @@ _LARGEST_SEED = 2**64 - 1
 _SCRIPTED = ("scripted",)
 _ROWS = ("returns", "success", "ever", "failed", "blocked")
 _QUANTILE = 1.959963984540054  # of the normal distribution, for 95 %
+_ERRORS = 2  # standard errors of a share of successes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,6 +120,16 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     middle = (share + square / 2) / (1 + square)
     half = _QUANTILE / (1 + square) * math.sqrt(share * (1 - share) / count + square / (4 * count))
     return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def noise_of_success(episodes: int, *shares: float) -> float:
+    """Two standard errors of a share of successes, or of the difference of two shares.
+
+    Args:
+        episodes: Number of episodes of each share, >= 1.
+        shares: One or two shares.
+    """
+    return _ERRORS * math.sqrt(sum(share * (1 - share) for share in shares) / episodes)
 
 
 @called("evaluate")

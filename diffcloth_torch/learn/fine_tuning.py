@@ -7,7 +7,6 @@ at once.
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +23,6 @@ __all__ = ["Kept", "TrustRegion", "for_fine_tuning"]
 _MAX_CHANGE = 0.02  # 0.1 in each action of a FoldCloth episode moves a picker by 9 cm
 _HELD_OUT = 16
 _HALVINGS = 20
-_ERRORS = 2  # standard errors of a share of successes
 _RESTORED = ("actor", "scale")  # parts of a policy on which actions depend
 
 
@@ -105,10 +103,6 @@ class Kept:
     success: float
     weights: dict[str, Tensor]
     steps: dict[str, Any]
-
-    def noise(self, starts: int) -> float:
-        """Fall of the success that a training tolerates: two standard errors of the share."""
-        return _ERRORS * math.sqrt(self.success * (1 - self.success) / starts)
 
     @staticmethod
     def weights_of(policy: Policy) -> dict[str, Tensor]:

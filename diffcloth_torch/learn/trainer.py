@@ -38,7 +38,7 @@ from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.action_steps import ROLLOUTS_KEPT, fit_moved_actions
 from diffcloth_torch.learn.adam import TensorAdam
-from diffcloth_torch.learn.evaluation import evaluate_starts, follow
+from diffcloth_torch.learn.evaluation import evaluate_starts, follow, noise_of_success
 from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.policy import TRAINER, Policy, begin_at, file_to_write
@@ -272,7 +272,7 @@ class Trainer:
             weights = Kept.weights_of(self.policy)
             steps = copy.deepcopy(self._actor_steps.state_dict())
             self._kept = Kept(self.updates, success, weights, steps)
-        elif final or kept.success - success > kept.noise(len(self.held_out)):
+        elif final or kept.success - success > noise_of_success(len(found), kept.success):
             kept.restore(self.policy, self._actor_steps)
             self.undone += 1
             undone = True

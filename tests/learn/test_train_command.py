@@ -152,6 +152,24 @@ def test_the_best_policy_is_kept_and_reported(config, tmp_path, looks):
     }
 
 
+@pytest.mark.parametrize(
+    ("found", "best", "better"),
+    [
+        ((0.8125, 31.0), (0.9375, 30.0), True),  # two successes of 16 may be chance
+        ((0.8125, 30.0), (0.9375, 30.0), False),
+        ((0.625, 40.0), (0.9375, 30.0), False),  # five are not
+        ((0.9375, 5.0), (0.625, 10.0), True),
+        ((0.875, 31.0), (1.0, 30.0), True),
+        ((0.75, 40.0), (1.0, 30.0), False),
+        ((0.25, -60.0), (0.0, -50.0), True),
+        ((0.0, -40.0), (0.0, -50.0), True),
+    ],
+)
+def test_differences_of_success_that_chance_may_cause_are_settled_by_return(found, best, better):
+    pairs = [dict(zip(("success", "return"), each, strict=True)) for each in (found, best)]
+    assert train_module._is_better(*pairs, 16) == better
+
+
 def test_the_last_policy_is_checked_at_held_out_starts(config, tmp_path, monkeypatch):
     calls = []
 
