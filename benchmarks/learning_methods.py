@@ -5,11 +5,10 @@
 `transfer` is the policy of `imitate` at another size. `plan` is `dc.learn.plan`.
 
 `apg`, `moves`, `shac` and `sapo` are `dc.learn.Trainer`. `moves` is APG with steps of actions
-(`action_step`), with equal options for all tasks. `apg` has the options of
-`configs/train_fold_gradients.yaml` on FoldCloth, and those of `OWN` on other tasks. `ppo` and `sac`
-are those of Stable-Baselines3, on the CPU, with their usual options except for the number of steps
-between updates and the initial noise. These six begin at the first action of the task, and return
-the policy after the last update.
+(`action_step`), with equal options for all tasks. `apg` has the options of `OWN` on three tasks.
+`ppo` and `sac` are those of Stable-Baselines3, on the CPU, with their usual options except for the
+number of steps between updates and the initial noise. These six begin at the first action of the
+task, and return the policy after the last update.
 
 Methods that learn from rewards use soft grasps, which have gradients, in tasks with pickers.
 """
@@ -40,8 +39,16 @@ PICKERS = ("FoldCloth", "FoldClothDiagonal", "SpreadCloth", "DropCloth", "FlingC
 NUM_ENVS = 4
 COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "init_std": 0.05, "target_entropy": -2.0}
 APG: dict[str, Any] = {"discount": 1.0, "learning_rate": 4e-3}
-OWN: dict[str, tuple[int, float]] = {"LiftCloth": (2, 4e-3), "PushCube": (4, 3e-3)}
-"""Number of environments and learning rate of `apg`."""
+# Late actions move a fold little, and one scale of Adam for each tensor changes them little.
+FOLD: dict[str, Any] = {
+    "learning_rate": 3e-4, "plan_learning_rate": 2e-2, "plan_knots": 12, "scale": "tensor",
+}  # fmt: skip
+OWN: dict[str, tuple[int, dict[str, Any]]] = {
+    "FoldCloth": (2, FOLD),
+    "LiftCloth": (2, {}),
+    "PushCube": (4, {"learning_rate": 3e-3}),
+}
+"""Number of environments, and options of `apg`."""
 MOVES: dict[str, Any] = {
     "discount": 1.0, "learning_rate": 2e-3, "plan_learning_rate": 1e-2, "plan_knots": 12,
     "action_step": 0.05, "draws": 16, "init_std": 0.02, "hidden": (128, 128),
@@ -191,12 +198,8 @@ def trainer_of(job: Job) -> tuple[TrainerOptions, int]:
     if job.method != "apg":  # half episodes: a critic estimates the value of the rest
         half = {"algorithm": job.method, "horizon": env.task.horizon // 2}
         return TrainerOptions(**(common | WITH_CRITIC | half)), NUM_ENVS
-    if job.task == "FoldCloth":
-        document = read_document(_CONFIGS / "train_fold_gradients.yaml")
-        given = {n: tuple(v) if isinstance(v, list) else v for n, v in document["trainer"].items()}
-        return TrainerOptions(**(given | {"seed": job.seed})), document["num_envs"]
-    num_envs, rate = OWN.get(job.task, (NUM_ENVS, APG["learning_rate"]))
-    return TrainerOptions(**(common | APG | {"learning_rate": rate} | whole)), num_envs
+    num_envs, own = OWN.get(job.task, (NUM_ENVS, {}))
+    return TrainerOptions(**(common | APG | own | whole)), num_envs
 
 
 def _free(job: Job) -> Acts:
