@@ -448,13 +448,16 @@ def test_starts_ask_for_feedback(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_no_constant_action_pays_more_than_the_script(name):
-    """200 constant actions, of full length along each axis and drawn, each in one start."""
+    """200 constant actions, of full length along each axis and drawn: those with the largest
+    returns in one start each have smaller mean returns than the script in 40 other starts."""
     env = make(name, 200)
     size = env.task.action_size
     axes = torch.cat([torch.eye(size), -torch.eye(size)])
     noise = torch.Generator().manual_seed(0)
     drawn = 2 * torch.rand(200 - len(axes), size, generator=noise) - 1
     constant = torch.cat([axes, drawn])
-    scripted, _, _ = run(env, lambda k: env.scripted_actions(), 300)
     found, _, _ = run(env, lambda k: constant, 300)
-    assert float(found.max()) < float(scripted.mean())
+    best = constant[found.argsort(descending=True)[:5]].repeat_interleave(40, 0)
+    again, _, _ = run(env, lambda k: best, 301)
+    scripted, _, _ = run(env, lambda k: env.scripted_actions(), 301)
+    assert float(again.view(5, 40).mean(1).max()) < float(scripted.mean())
