@@ -448,15 +448,15 @@ def test_starts_ask_for_feedback(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_no_constant_action_pays_more_than_the_script(name):
-    """200 constant actions, of full length along each axis and drawn: those with the largest
-    returns in one start each have smaller mean returns than the script in 40 other starts."""
+    """200 constant actions, of full length along each axis and drawn: the five with the largest
+    mean returns in three starts have smaller ones than the script in 40 other starts."""
     env = make(name, 200)
     size = env.task.action_size
     axes = torch.cat([torch.eye(size), -torch.eye(size)])
     noise = torch.Generator().manual_seed(0)
     drawn = 2 * torch.rand(200 - len(axes), size, generator=noise) - 1
     constant = torch.cat([axes, drawn])
-    found, _, _ = run(env, lambda k: constant, 300)
+    found = sum(run(env, lambda k: constant, seed)[0] for seed in (300, 302, 303))
     best = constant[found.argsort(descending=True)[:5]].repeat_interleave(40, 0)
     again, _, _ = run(env, lambda k: best, 301)
     scripted, _, _ = run(env, lambda k: env.scripted_actions(), 301)
