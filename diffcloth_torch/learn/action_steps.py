@@ -19,10 +19,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.learn.policy import Policy
 from diffcloth_torch.learn.rollouts import unit_gradients
 
-__all__ = ["ROLLOUTS_KEPT", "fit_moved_actions", "moved_actions"]
-
-ROLLOUTS_KEPT = 10
-"""Number of former rollouts at whose observations a fit retains the actions."""
+__all__ = ["fit_moved_actions", "moved_actions"]
 
 _LARGEST_ACTION = 0.995  # moved actions are clipped to this, short of the ends of tanh
 _FORMER_SHARE = 2  # ratio of former observations to new observations in a step of the fit

@@ -25,6 +25,7 @@ _POSITIVE = (
 )  # fmt: skip
 _COUNTS = (
     "horizon", "critic_epochs", "critic_batches", "critics", "check_every", "fit_iterations",
+    "retained_rollouts",
 )  # fmt: skip
 
 
@@ -95,15 +96,17 @@ class TrainerOptions(_RefusesOldNames):
             each environment with respect to its actions is divided by its own norm and moves the
             actions of the rollout by this step, and the policy is fitted to the moved actions by
             `fit_iterations` steps of Adam, while its actions are retained at observations of the
-            ten rollouts before. Rewards of the last `Task.holds` steps of an episode without
-            success count four times. The step falls with `decay_updates`, the scale of observations
-            is fixed after ten updates, and `max_grad_norm` has no effect. Not with "sapo", whose
-            loss depends on more than actions, nor with `feedback`. None: a step of Adam along the
-            gradient of the weights.
+            `retained_rollouts` rollouts before. Rewards of the last `Task.holds` steps of an
+            episode without success count four times. The step falls with `decay_updates`, the scale
+            of observations is fixed after ten updates, and `max_grad_norm` has no effect. Not with
+            "sapo", whose loss depends on more than actions, nor with `feedback`. None: a step of
+            Adam along the gradient of the weights.
         max_move: Largest change of a number of an action at which an update with `action_step`
             aims. Where the gradient concentrates on few numbers, such as the effort of fingers, a
             large move crosses cliffs of the return.
         fit_iterations: Steps of Adam in an update with `action_step`.
+        retained_rollouts: Number of former rollouts at whose observations an update with
+            `action_step` retains the actions. Tasks whose starts need different motions need more.
         draws: Number of plans of which the training begins at the best, by the mean reward of a
             rollout without noise: the initial plan, which is `first_action` or the plan of an
             initial policy, and random plans near this plan. It needs `plan_knots`. 0: the initial
@@ -151,6 +154,7 @@ class TrainerOptions(_RefusesOldNames):
     action_step: float | None = None
     max_move: float = 0.3
     fit_iterations: int = 20
+    retained_rollouts: int = 10
     draws: int = 0
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0

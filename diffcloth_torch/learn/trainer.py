@@ -36,7 +36,7 @@ from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import as_path
-from diffcloth_torch.learn.action_steps import ROLLOUTS_KEPT, fit_moved_actions
+from diffcloth_torch.learn.action_steps import fit_moved_actions
 from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.evaluation import evaluate_starts, follow, noise_of_success
 from diffcloth_torch.learn.fine_tuning import Kept, TrustRegion, for_fine_tuning
@@ -367,7 +367,8 @@ class Trainer:
 
     def _check_former(self, owner: str, given: Any, updates: int) -> None:
         """Require the observations of the last rollouts."""
-        count = 0 if self.options.action_step is None else min(updates, ROLLOUTS_KEPT)
+        o = self.options
+        count = 0 if o.action_step is None else min(updates, o.retained_rollouts)
         rows = self.options.horizon * self._count
         like = cpu.zeros(rows, self.policy.observations, dtype=torch.float32)
         check_like(owner, given, [like] * count)
@@ -540,7 +541,7 @@ class Trainer:
                 self._actor_steps,
                 self._noise,
             )
-        self._former = [*self._former, seen.flatten(0, 1)][-ROLLOUTS_KEPT:]
+        self._former = [*self._former, seen.flatten(0, 1)][-self.options.retained_rollouts :]
         return log
 
     def _draw_plan(self) -> None:

@@ -12,7 +12,7 @@ import torch
 import diffcloth_torch as dc
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import Trainer, TrainerOptions
-from diffcloth_torch.learn.action_steps import ROLLOUTS_KEPT, fit_moved_actions, moved_actions
+from diffcloth_torch.learn.action_steps import fit_moved_actions, moved_actions
 from diffcloth_torch.learn.rollouts import LAST_WEIGHT, roll_out
 from diffcloth_torch.learn.trainer import record_of, restore
 
@@ -175,15 +175,22 @@ def test_updates_have_the_same_bits_for_any_workers():
     other._workers.close()
 
 
-def test_a_file_needs_the_observations_of_the_last_rollouts():
-    trainer = Trainer(make, replace(OPTIONS, horizon=2), num_envs=1)
-    for _ in range(ROLLOUTS_KEPT + 1):
+@pytest.mark.parametrize("retained", [1, 3])
+def test_a_file_needs_the_observations_of_the_last_rollouts(retained):
+    options = replace(OPTIONS, horizon=2, retained_rollouts=retained)
+    trainer = Trainer(make, options, num_envs=1)
+    seen = []
+    for _ in range(retained + 1):
+        noise = trainer._noise.get_state()
+        (piece,) = trainer._pieces(learns=True)
+        seen.append(roll_out(make(1), piece).seen.flatten(0, 1))
+        trainer._noise.set_state(noise)
         trainer.update()
     record = record_of(trainer)
-    assert len(record["former"]) == ROLLOUTS_KEPT
+    assert torch.equal(torch.stack(record["former"]), torch.stack(seen[-retained:]))
     record["former"].pop()
     before = weights(trainer)
-    with pytest.raises(InvalidInput, match=r"\['former'\] must be a list of 10"):
+    with pytest.raises(InvalidInput, match=rf"\['former'\] must be a list of {retained}"):
         restore(trainer, record)
     assert_same_bits(before, weights(trainer))
 
