@@ -292,6 +292,8 @@ def residuals(parameters, values):
 
 
 class TestFit:
+    # Residuals that a change makes large are a bad fit, and `fit` warns about it.
+    @pytest.mark.filterwarnings("ignore::diffcloth_torch.errors.CorrelatedResidualsWarning")
     @COUNTS
     def test_changes_of_evaluations_are_refused_or_harmless(self, tmp_path, count):
         generator = random.Random(3)
