@@ -19,7 +19,7 @@ _COLUMNS = {
     "imitate": [
         ("imitation", "share"),
         ("its return", "mean"),
-        ("seeds", "seeds"),
+        ("successes by seed", "by_seed"),
         ("steps", "steps"),
         ("minutes", "minutes"),
     ],
@@ -33,14 +33,14 @@ class Pooled:
 
     Attributes:
         share: Successes of all episodes, with the Wilson interval.
-        seeds: Number of seeds.
+        by_seed: Number of successes of each seed.
         mean: Mean of the returns.
         steps: Mean of the environment steps of learning.
         minutes: Mean processor time of learning [min].
     """
 
     share: str
-    seeds: int
+    by_seed: str
     mean: str
     steps: str
     minutes: str
@@ -49,12 +49,12 @@ class Pooled:
 def pooled(rows: Rows) -> Pooled:
     """Pool rows that differ in their seeds."""
     count = sum(row["episodes"] for row in rows)
-    done = sum(round(row["success"] * row["episodes"]) for row in rows)
+    done = {row["seed"]: round(row["success"] * row["episodes"]) for row in rows}
     return Pooled(
-        share(done, count),
-        len(rows),
+        share(sum(done.values()), count),
+        ", ".join(f"{seed}: {successes}" for seed, successes in sorted(done.items())),
         f"{fmean(row['return'] for row in rows):.1f}",
-        f"{fmean(row['steps'] for row in rows):.0f}",
+        f"{fmean(row['steps'] for row in rows):,.0f}",
         f"{fmean(row['minutes'] for row in rows):.1f}",
     )
 
@@ -80,7 +80,7 @@ def _imitation(rows: Rows, tasks: Iterable[str]) -> str:
 
 
 def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
-    names = ("seeds", "share", "mean", "steps", "minutes")
+    names = ("by_seed", "share", "mean", "steps", "minutes")
     lines = []
     for task in tasks:
         for method in (*FROM_REWARDS, "plan"):
@@ -90,7 +90,7 @@ def _from_rewards(rows: Rows, tasks: Iterable[str]) -> str:
                 lines.append(
                     [f"`{task}`", _NAMES.get(method, method.upper()), *_cells(same, names)]
                 )
-    head = ["task", "method", "seeds", "success", "return", "steps", "minutes"]
+    head = ["task", "method", "successes by seed", "success", "return", "steps", "minutes"]
     return table(head, lines)
 
 

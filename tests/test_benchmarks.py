@@ -578,10 +578,10 @@ def test_tables_of_learning_pool_seeds():
     assert text.splitlines()[:2] == ["a", "<!-- methods -->"]
     assert text.splitlines()[-2:] == ["<!-- end of methods -->", "b"]
     assert "old" not in text
-    cells = "|  |  |  | 75 % (41 % to 93 %) | 1.5 | 2 | 10 | 0.5 | 25 % (5 % to 70 %) |"
+    cells = "|  |  |  | 75 % (41 % to 93 %) | 1.5 | 0: 4, 1: 2 | 10 | 0.5 | 25 % (5 % to 70 %) |"
     assert "| `HitCloth` " + cells in text
-    assert "| `HitCloth` | PPO | 1 | 0 % (0 % to 49 %) | 1.0 | 10 | 0.5 |" in text
-    assert "| `HitCloth` | PPO | 1 | 50 % (15 % to 85 %) | 1.0 | 10 | 0.5 |" in text
+    assert "| `HitCloth` | PPO | 0: 0 | 0 % (0 % to 49 %) | 1.0 | 10 | 0.5 |" in text
+    assert "| `HitCloth` | PPO | 0: 2 | 50 % (15 % to 85 %) | 1.0 | 10 | 0.5 |" in text
     assert tables.with_tables(text, rows) == text
     with pytest.raises(ValueError, match="the page must have lines"):
         tables.with_tables("a", rows)
