@@ -49,10 +49,10 @@ class Pooled:
 def pooled(rows: Rows) -> Pooled:
     """Pool rows that differ in their seeds."""
     count = sum(row["episodes"] for row in rows)
-    done = {row["seed"]: round(row["success"] * row["episodes"]) for row in rows}
+    done = sorted((row["seed"], round(row["success"] * row["episodes"])) for row in rows)
     return Pooled(
-        share(sum(done.values()), count),
-        ", ".join(f"{seed}: {successes}" for seed, successes in sorted(done.items())),
+        share(sum(successes for _, successes in done), count),
+        ", ".join(f"{seed}: {successes}" for seed, successes in done),
         f"{fmean(row['return'] for row in rows):.1f}",
         f"{fmean(row['steps'] for row in rows):,.0f}",
         f"{fmean(row['minutes'] for row in rows):.1f}",

@@ -583,6 +583,8 @@ def test_tables_of_learning_pool_seeds():
     assert "| `HitCloth` | PPO | 0: 0 | 0 % (0 % to 49 %) | 1.0 | 10 | 0.5 |" in text
     assert "| `HitCloth` | PPO | 0: 2 | 50 % (15 % to 85 %) | 1.0 | 10 | 0.5 |" in text
     assert tables.with_tables(text, rows) == text
+    same = tables.pooled([row("imitate", 0, 1.0), row("imitate", 0, 0.5, size=9)])
+    assert (same.share, same.by_seed) == ("75 % (41 % to 93 %)", "0: 2, 0: 4")
     with pytest.raises(ValueError, match="the page must have lines"):
         tables.with_tables("a", rows)
 
