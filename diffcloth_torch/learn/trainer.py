@@ -369,8 +369,7 @@ class Trainer:
         """Require the observations of the last rollouts."""
         o = self.options
         count = 0 if o.action_step is None else min(updates, o.retained_rollouts)
-        rows = self.options.horizon * self._count
-        like = cpu.zeros(rows, self.policy.observations, dtype=torch.float32)
+        like = cpu.zeros(o.horizon * self._count, self.policy.observations, dtype=torch.float32)
         check_like(owner, given, [like] * count)
 
     def _checked_places(self, owner: str, given: Any) -> list[tuple[EnvState, list[Tensor]]]:
