@@ -15,6 +15,7 @@ from diffcloth_torch.envs.actuators import Actuator
 from diffcloth_torch.envs.depth_camera import DepthCamera, Sight
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.frames import points_in, poses_in
+from diffcloth_torch.envs.key_points import KeyPoints
 from diffcloth_torch.envs.randomization import Ranges
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.cloth import Cloth
@@ -24,12 +25,11 @@ from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 
-__all__ = ["DT", "BuiltTask", "key_rows", "with_material"]
+__all__ = ["DT", "BuiltTask", "with_material"]
 
 DT = 0.02  # [s]
 OF_CAMERA = ("depth", "points")
 OBSERVATIONS = ("keypoints", "particles", *OF_CAMERA)
-_KEY_POINTS = 4  # along a side
 
 
 class BuiltTask(Task):
@@ -38,6 +38,7 @@ class BuiltTask(Task):
     Attributes:
         side: Number of vertices along a side of a sheet.
         sees: "keypoints", "particles", "depth" or "points": how the cloth is observed.
+        seen: Points of the cloth that are observed without a camera.
         camera: The camera of "depth" and "points"; None with the others.
         view: The camera of the task, unless another is passed; a task may have none.
         of_cloth: Names of the features that are known from the vertices of cloths alone: "depth"
@@ -69,8 +70,9 @@ class BuiltTask(Task):
             size: Vertices along a side of a sheet, >= 4.
             horizon: Transitions of an episode; by default a fifth more than the script needs.
             substeps: Time steps of a transition, of .02 s each.
-            observation: Observation of the cloth: "keypoints" for some vertices, "particles" for
-                all, "depth" for an image or "points" for a point cloud of a depth camera.
+            observation: Observation of the cloth: "keypoints" for material points that do not
+                depend on the size, "particles" for all vertices, "depth" for an image or "points"
+                for a point cloud of a depth camera.
             camera: Camera of "depth" and "points"; None means the camera of the task.
             material: Material of the cloths; None means the material of the task.
             contact: Options of contact; None means the options of the task.
@@ -101,6 +103,7 @@ class BuiltTask(Task):
                 "a camera"
             )
         scene, actuator = self.build(material)
+        self.seen = self.key_points()
         self.camera, self._sight = None, None
         if self.sees in OF_CAMERA:
             self.camera = self.view if camera is None else camera
@@ -130,6 +133,12 @@ class BuiltTask(Task):
     def build(self, material: Material | None) -> tuple[Scene, Actuator]:
         """The scene, and its actuator."""
 
+    def key_points(self) -> KeyPoints:
+        """Points of the cloth that `features` observe: by default of one square sheet."""
+        if self.sees == "particles":
+            return KeyPoints.all(self.side**2)
+        return KeyPoints.on_grid((self.side, self.side))
+
     def contact(self) -> ContactOptions:
         """Options of contact, unless others are given."""
         return ContactOptions()
@@ -155,14 +164,6 @@ class BuiltTask(Task):
         pose = cpu.tensor(self.camera.pose).expand(len(env), -1)
         depths = self._sight.depths(env.state).flatten(1)
         return {"depth": depths, "camera": poses_in(env.drawn, pose)} | others
-
-
-def key_rows(size: int, observation: str) -> Tensor:
-    """Vertices of a square sheet that are observed: 4 x 4 of them, or all."""
-    if observation == "particles":
-        return cpu.arange(size * size)
-    some = cpu.linspace(0, size - 1, _KEY_POINTS).round().long()
-    return (some[:, None] * size + some).flatten()
 
 
 def with_material(cloth: Cloth, material: Material | None) -> Cloth:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Hand, Tools
-from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.built import DT, BuiltTask, with_material
 from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.frames import Frame, points_in, pose_frame, poses_in, vectors_in
@@ -56,7 +56,6 @@ class HandTask(BuiltTask):
         self.hand = Hand("gripper", _JOINTS, dt=DT)
         self.center = cpu.tensor(sections["scene"]["cloths"][0]["pose"]["position"])
         self.target = cpu.tensor(pose_of(sections["target"]["pose"]))
-        self._rows = key_rows(self.side, self.sees)
         corners = [0, self.side - 1, self.side * (self.side - 1), self.side**2 - 1]
         self._corners = cpu.tensor(corners, dtype=torch.int64)
         cloths = [with_material(cloth, material) for cloth in scene.cloths]
@@ -85,17 +84,17 @@ class HandTask(BuiltTask):
         return pose_frame(drawn["base"])
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of the cloth, the hand and its joints, the corners at the start, the goal.
+        """Points of the cloth, the hand and its joints, the corners at the start, the goal.
 
         Lengths are in units of the side of the cloth.
         """
-        state, rows, drawn = env.state, self._rows, env.drawn
-        positions = state.positions[:, rows]
+        state, seen, drawn = env.state, self.seen, env.drawn
+        positions = seen.of(state.positions)
         start, goal = drawn["start"][:, self._corners], drawn["goal"]
-        sizes = [len(rows), 4, goal.shape[1]]
+        sizes = [len(seen), 4, goal.shape[1]]
         points = points_in(drawn, torch.cat([positions, start, goal], dim=1)) / LENGTH
         placed = [part.flatten(1) for part in torch.split(points, sizes, dim=1)]
-        pairs = [state.velocities[:, rows], state.contact_forces[:, rows]]
+        pairs = [seen.of(state.velocities), seen.of(state.contact_forces)]
         velocities, forces = vectors_in(drawn, torch.cat(pairs, dim=1)).chunk(2, dim=1)
         return {
             "positions": placed[0],

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Tools, Twist
-from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.built import DT, BuiltTask, with_material
 from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
@@ -51,7 +51,6 @@ class HitCloth(BuiltTask):
         """See `BuiltTask`."""
         scene, sections = scene_of("hit_cloth", grid_changes("sheet", self.side))
         sheet = with_material(scene.cloths[0], material)
-        self._rows = key_rows(self.side, self.sees)
         self._pins = float(pose_of(sections["target"]["pose"])[2])  # their height [m]
         rest = cpu.tensor(sheet.rest_positions)
         self._across, self._down = rest[:, 0], _LENGTH / 2 - rest[:, 1]
@@ -84,12 +83,12 @@ class HitCloth(BuiltTask):
         return state.replace(body_poses=poses), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of the sheet, their way to the target, the cuboid, and the angle."""
-        positions = env.state.positions[:, self._rows]
+        """Points of the sheet, their way to the target, the cuboid, and the angle."""
+        positions = self.seen.of(env.state.positions)
         return {
             "positions": positions.flatten(1),
-            "velocities": env.state.velocities[:, self._rows].flatten(1),
-            "to_target": (env.drawn["target"][:, self._rows] - positions).flatten(1),
+            "velocities": self.seen.of(env.state.velocities).flatten(1),
+            "to_target": (self.seen.of(env.drawn["target"]) - positions).flatten(1),
             "cuboid": env.state.body_poses[:, 0],
             "goal": env.drawn["angle"][:, None],
             "time": self.observed(env.elapsed),

@@ -57,9 +57,6 @@ class PushCube(BuiltTask):
         sheet = with_material(scene.cloths[0], material)
         pins = {f"sheet/{name}": list(rows) for name, rows in sheet.pins.items()}
         self._pins = [row for rows in pins.values() for row in rows]
-        count = size * size
-        some = cpu.linspace(0, count - 1, 16).round().long()
-        self._rows = cpu.arange(count) if self.sees == "particles" else some
         return Scene([sheet], scene.bodies), Velocities(pins, dt=DT, speed=_SPEED)
 
     @property
@@ -89,15 +86,15 @@ class PushCube(BuiltTask):
         return level_frame(state.body_poses[:, 0, :3], drawn["way"])
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Pins, some vertices of the sheet, the cube and its remaining way to the target."""
-        state, rows, drawn = env.state, self._rows, env.drawn
+        """Pins, points of the sheet, the cube and its remaining way to the target."""
+        state, seen, drawn = env.state, self.seen, env.drawn
         away = torch.nn.functional.pad(self._away(env), (0, 1))[:, None]
-        points = [state.positions[:, self._pins], state.positions[:, rows]]
+        points = [state.positions[:, self._pins], seen.of(state.positions)]
         placed = points_in(drawn, torch.cat(points, dim=1))
-        pins, positions = torch.split(placed, [len(self._pins), len(rows)], dim=1)
+        pins, positions = torch.split(placed, [len(self._pins), len(seen)], dim=1)
         twist = state.body_velocities[:, 0].reshape(-1, 2, 3)
-        vectors = vectors_in(drawn, torch.cat([state.velocities[:, rows], twist, away], dim=1))
-        velocities, twist, away = torch.split(vectors, [len(rows), 2, 1], dim=1)
+        vectors = vectors_in(drawn, torch.cat([seen.of(state.velocities), twist, away], dim=1))
+        velocities, twist, away = torch.split(vectors, [len(seen), 2, 1], dim=1)
         return {
             "pins": pins.flatten(1),
             "positions": positions.flatten(1),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Actuator, Pickers, Tools
-from diffcloth_torch.envs.built import BuiltTask, key_rows
+from diffcloth_torch.envs.built import BuiltTask
 from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.frames import Frame, level_frame, points_in, vectors_in
@@ -66,7 +66,6 @@ class SheetTask(BuiltTask):
         """
         self._grasp = opens_at, reach
         super().__init__(**options)
-        self.key_points = key_rows(self.side, self.sees)
         self._corners = cpu.tensor(
             [self.vertex(row, column) for row in (0, -1) for column in (0, -1)], dtype=torch.int64
         )
@@ -171,16 +170,16 @@ class SheetTask(BuiltTask):
         Lengths are in units of .3 m, the side without a scale, velocities in m/s, forces in weights
         of a vertex of that sheet.
         """
-        state, rows, drawn = env.state, self.key_points, env.drawn
-        points = [state.positions[:, rows], env.tools["points"], drawn["start"][:, self._corners]]
-        sizes = [len(rows), self.pickers.count, 4]
+        state, seen, drawn = env.state, self.seen, env.drawn
+        points = [seen.of(state.positions), env.tools["points"], drawn["start"][:, self._corners]]
+        sizes = [len(seen), self.pickers.count, 4]
         if "goal" in drawn:
             points.append(drawn["goal"])
             sizes.append(drawn["goal"].shape[1])
         placed = points_in(drawn, torch.cat(points, dim=1)) / SIDE
         parts = [part.flatten(1) for part in torch.split(placed, sizes, dim=1)]
-        forces = state.contact_forces[:, rows] / self._share
-        vectors = vectors_in(drawn, torch.cat([state.velocities[:, rows], forces], dim=1))
+        forces = seen.of(state.contact_forces) / self._share
+        vectors = vectors_in(drawn, torch.cat([seen.of(state.velocities), forces], dim=1))
         velocities, forces = vectors.chunk(2, dim=1)
         return {
             "positions": parts[0],

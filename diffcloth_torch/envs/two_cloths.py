@@ -10,6 +10,7 @@ from diffcloth_torch.envs.actuators import Actuator, Forces, Tools
 from diffcloth_torch.envs.built import BuiltTask, with_material
 from diffcloth_torch.envs.depth_camera import DepthCamera
 from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.key_points import KeyPoints
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.scene import Scene
@@ -55,9 +56,16 @@ class TwoCloths(BuiltTask):
         pulled = [count + i for i in ends]
         steady[pulled] = cpu.tensor([_PULL, 0.0, weight]) / len(ends)
         self._count, self._center = count, cpu.tensor(sections["target"]["position"])
-        some = cpu.linspace(0, 2 * count - 1, 20).round().long()
-        self._rows = cpu.arange(2 * count) if self.sees == "particles" else some
+        self._grid = count // columns, columns
         return Scene(cloths), Forces([ends], steady, largest=_LARGEST)
+
+    def key_points(self) -> KeyPoints:
+        """2 x 5 points of each strip."""
+        if self.sees == "particles":
+            return KeyPoints.all(2 * self._count)
+        one = KeyPoints.on_grid(self._grid, (2, 5))
+        vertices = torch.cat([one.vertices, self._count + one.vertices], dim=1)
+        return KeyPoints(vertices, torch.cat([one.weights] * 2, dim=1))
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The target, within 3 cm."""
@@ -68,11 +76,11 @@ class TwoCloths(BuiltTask):
         return self.simulator.initial_state(len(drawn["target"])), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of both strips, and the remaining way of the center, or the target."""
+        """Points of both strips, and the remaining way of the center, or the target."""
         state = env.state
         return {
-            "positions": state.positions[:, self._rows].flatten(1),
-            "velocities": state.velocities[:, self._rows].flatten(1),
+            "positions": self.seen.of(state.positions).flatten(1),
+            "velocities": self.seen.of(state.velocities).flatten(1),
             "to_target": self._away(env),
             "center_velocity": state.velocities[:, : self._count].mean(dim=1),
             **({} if self.camera is None else {"goal": env.drawn["target"]}),
