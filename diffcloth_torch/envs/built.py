@@ -136,7 +136,7 @@ class BuiltTask(Task):
     def key_points(self) -> KeyPoints:
         """Points of the cloth that `features` observe: by default of one square sheet."""
         if self.sees == "particles":
-            return KeyPoints.all(self.side**2)
+            return KeyPoints.at(cpu.arange(self.side**2))
         return KeyPoints.on_grid((self.side, self.side))
 
     def contact(self) -> ContactOptions:

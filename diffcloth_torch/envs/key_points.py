@@ -28,9 +28,9 @@ class KeyPoints:
     weights: Tensor
 
     @staticmethod
-    def all(count: int) -> KeyPoints:
-        """All vertices of a mesh, in their order."""
-        return KeyPoints(cpu.arange(count)[None], cpu.ones(1, count, 1))
+    def at(vertices: Tensor) -> KeyPoints:
+        """Vertices [n] by their indices."""
+        return KeyPoints(vertices[None], cpu.ones(1, len(vertices), 1))
 
     @staticmethod
     def on_grid(size: tuple[int, int], shape: tuple[int, int] = (4, 4)) -> KeyPoints:

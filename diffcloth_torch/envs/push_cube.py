@@ -100,7 +100,7 @@ class PushCube(BuiltTask):
             "positions": positions.flatten(1),
             "velocities": velocities.flatten(1),
             "cube": poses_in(drawn, state.body_poses[:, 0]),
-            "cube_velocities": twist.flatten(1),
+            "cube_twist": twist.flatten(1),
             "to_target": away[:, 0, :2],
             "time": self.observed(env.elapsed),
         }
