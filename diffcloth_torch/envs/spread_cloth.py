@@ -146,19 +146,22 @@ class SpreadCloth(SheetTask):
         return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=-1)[:, None]
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close on the edges, pull them apart, release."""
+        """Close on the edges, raise them, so that none stays turned under, pull, and release."""
         here = at(env.drawn["start"], env.drawn["picked"])
-        along = self.along(env) * cpu.tensor([[-0.5], [0.5]])
-        apart = here.mean(dim=1, keepdim=True) + self.sides(env.drawn)[:, None, None] * along
-        apart = torch.cat([apart[..., :2], torch.full_like(apart[..., 2:], 0.01)], dim=-1)
+        side = self.sides(env.drawn)[:, None, None]
+        along = side * self.along(env) * cpu.tensor([[-0.5], [0.5]])
+        apart = here.mean(dim=1, keepdim=True) + along
+        low, high = torch.full_like(here[..., 2:], 0.01), (side / 6).expand_as(here[..., 2:])
+        raised = torch.cat([here[..., :2], high], dim=-1)
+        above, laid = (torch.cat([apart[..., :2], z], dim=-1) for z in (high, low))
         up = cpu.tensor([0.0, 0.0, 0.03])
         return self.moves_to(
             env,
             *follow(
                 env,
-                [4, 6, 26, 30, 34],
-                [here, here, apart, apart, apart + up],
-                [-1.0, 1.0, 1.0, 1.0, -1.0],
+                [4, 6, 8, 22, 26, 30, 34],
+                [here, here, raised, above, laid, laid, laid + up],
+                [-1.0, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0],
             ),
         )
 

@@ -10,7 +10,7 @@ import torch
 
 from diffcloth_torch import envs
 from diffcloth_torch.envs.env import lengths
-from diffcloth_torch.envs.sheets import follow
+from diffcloth_torch.envs.sheets import at, follow
 from diffcloth_torch.geometry.poses import transform
 
 SMALL = 4
@@ -73,6 +73,24 @@ def test_pleats_lie_across_the_way_of_the_pickers():
         picked = sheet[row].reshape(-1, 3)[task.picked(drawn)[row]]
         way = picked[1] - picked[0]
         assert float(way @ along[row]) == pytest.approx(float(lengths(way[:2])))
+
+
+@pytest.mark.parametrize(("elapsed", "share"), [(7, 0.0), (21, 1.0)])
+def test_the_script_of_a_spread_pulls_raised_edges(elapsed, share):
+    """Edges that are pulled along the table stay turned under the sheet."""
+    task, state = begun("SpreadCloth", 2)
+    held = at(state.drawn["start"], state.drawn["picked"])
+    sides = task.along(state) * torch.tensor([[-0.15], [0.15]], dtype=torch.float64)
+    wanted = held + share * (held.mean(dim=1, keepdim=True) + sides - held)
+    wanted[..., 2] = 0.05
+    there = replace(
+        state,
+        elapsed=torch.full((2,), elapsed),
+        tools=state.tools | {"points": wanted},
+    )
+    moves, grasp = task.scripted(there).reshape(2, 2, 4).split([3, 1], dim=-1)
+    torch.testing.assert_close(moves, torch.zeros_like(moves), rtol=0, atol=1e-9)
+    assert bool((grasp == 1).all())
 
 
 def test_the_script_of_a_fling_follows_corners_until_its_pickers_are_closed():
