@@ -17,7 +17,7 @@ class KeyPoints:
     """Material points of cloth; each is a vertex, or lies between the four vertices of a cell.
 
     Points that are evenly spaced between the edges of a sheet do not depend on the size of its
-    mesh, and neither does a policy that observes them. Vertices near these points would.
+    mesh, and neither does a policy that observes them. The vertices nearest to them do.
 
     Attributes:
         vertices: Vertices of each point, [k, n], with k = 1 or 4.
@@ -47,8 +47,8 @@ class KeyPoints:
             for j in (0, 1):
                 vertices.append((rows[i][:, None] * size[1] + columns[j]).flatten())
                 weights.append((down[i][:, None] * right[j]).flatten())
-        if bool((weights[0] == 1).all()):  # all points are vertices
-            del vertices[1:], weights[1:]
+        if bool((weights[0] == 1).all()):
+            return KeyPoints.at(vertices[0])
         return KeyPoints(torch.stack(vertices), torch.stack(weights)[..., None])
 
     def __len__(self) -> int:

@@ -22,6 +22,18 @@ def begun(name, num_envs):
     return env.task, env.env_state
 
 
+def assert_held_at(task, state, elapsed, wanted):
+    """After `elapsed` transitions the script holds closed pickers at points [2, 2, 3]."""
+    there = replace(
+        state,
+        elapsed=torch.full((2,), elapsed),
+        tools=state.tools | {"points": wanted},
+    )
+    moves, grasp = task.scripted(there).reshape(2, 2, 4).split([3, 1], dim=-1)
+    torch.testing.assert_close(moves, torch.zeros_like(moves), rtol=0, atol=1e-9)
+    assert bool((grasp == 1).all())
+
+
 def test_a_path_reaches_each_of_its_points_in_time_and_stays_at_the_last():
     _, state = begun("FoldCloth", 6)
     generator = torch.Generator().manual_seed(0)
@@ -45,14 +57,7 @@ def test_the_script_of_a_drop_moves_level_until_the_edge_is_over_its_goal(elapse
     wanted = held.clone()
     wanted[..., :2] += share * (edge - held)[..., :2]
     assert float(lengths(wanted - held).min()) > 0.005
-    there = replace(
-        state,
-        elapsed=torch.full((2,), elapsed),
-        tools=state.tools | {"points": wanted},
-    )
-    moves, grasp = task.scripted(there).reshape(2, 2, 4).split([3, 1], dim=-1)
-    torch.testing.assert_close(moves, torch.zeros_like(moves), rtol=0, atol=1e-9)
-    assert bool((grasp == 1).all())
+    assert_held_at(task, state, elapsed, wanted)
 
 
 def test_pleats_lie_across_the_way_of_the_pickers():
@@ -83,14 +88,7 @@ def test_the_script_of_a_spread_pulls_raised_edges(elapsed, share):
     sides = task.along(state) * torch.tensor([[-0.15], [0.15]], dtype=torch.float64)
     wanted = held + share * (held.mean(dim=1, keepdim=True) + sides - held)
     wanted[..., 2] = 0.05
-    there = replace(
-        state,
-        elapsed=torch.full((2,), elapsed),
-        tools=state.tools | {"points": wanted},
-    )
-    moves, grasp = task.scripted(there).reshape(2, 2, 4).split([3, 1], dim=-1)
-    torch.testing.assert_close(moves, torch.zeros_like(moves), rtol=0, atol=1e-9)
-    assert bool((grasp == 1).all())
+    assert_held_at(task, state, elapsed, wanted)
 
 
 def test_the_script_of_a_fling_follows_corners_until_its_pickers_are_closed():
