@@ -7,6 +7,7 @@ import torch
 
 import diffcloth_torch.envs as envs
 from diffcloth_torch.envs.key_points import KeyPoints
+from diffcloth_torch.envs.sheets import SIDE
 
 # Sheets whose shape at the start does not depend on the size of the mesh.
 ALIKE = ("FoldCloth", "DropCloth", "LiftCloth", "HangCloth", "GraspCloth", "HitCloth", "PushCube")
@@ -68,10 +69,12 @@ def test_strips_are_observed_at_the_vertices_of_0_1():
 
 @pytest.mark.parametrize("name", ["FoldCloth", "HitCloth", "TwoCloths"])
 def test_all_vertices_are_particles(name):
-    env = envs.make(name, 1, size=8, observation="particles")
+    env = envs.make(name, 1, size=8, observation="particles", frame="world")
     env.reset(seed=0)
-    seen = env.task.features(env.env_state)["velocities"]
-    assert seen.numel() == env.env_state.state.velocities.numel()
+    seen, state = env.task.features(env.env_state), env.env_state.state
+    assert seen["velocities"].numel() == state.velocities.numel()
+    unit = SIDE if name == "FoldCloth" else 1.0
+    assert torch.equal(seen["positions"], state.positions.flatten(1) / unit)
 
 
 def test_a_point_does_not_depend_on_the_number_of_rows():
