@@ -30,7 +30,7 @@ _CLOSE = 0.03  # largest distance to the target for success, a tenth of the shee
 class PushCube(BuiltTask):
     """The two upper corners of a hanging sheet move, and the sheet pushes a cube to a target.
 
-    The start draws the place of the cube, within 2 cm, and its target, within 5 cm along both axes.
+    The start draws the place of the cube, within 2 cm, and its target, within 7 cm along both axes.
     With the distance d of the cube's center from the target the reward is
     graded(d, side / 10, side / 2); the task of the paper, section V.D.2. The frame of the task is
     the cube at the start, with x to its target.
@@ -66,10 +66,10 @@ class PushCube(BuiltTask):
         return along * (self.action_size // 3)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """The place of the cube, within 2 cm, and its target, within 5 cm."""
+        """The place of the cube, within 2 cm, and its target, within 7 cm."""
         return {
             "cube": uniform(generator, 2, -0.02, 0.02),
-            "target": cpu.tensor([0.0, 0.22]) + uniform(generator, 2, -0.05, 0.05),
+            "target": cpu.tensor([0.0, 0.22]) + uniform(generator, 2, -0.07, 0.07),
         }
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:

@@ -426,7 +426,7 @@ def run(env, act, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_starts_ask_for_feedback(name):
-    """Success over 64 starts: script, actions of another episode, no actions, random actions."""
+    """Success over 64 starts: script, actions of other episodes, no actions, random actions."""
     env = make(name, 64, size=7)
     actions = env.task.action_size
     noise = torch.Generator().manual_seed(0)
@@ -434,7 +434,7 @@ def test_starts_ask_for_feedback(name):
     assert int(success.sum()) >= 0.92 * 64
     one = make(name, 1, size=7)
     found = []
-    for seed in (200, 201):
+    for seed in range(200, 206):
         _, _, replay = run(one, lambda k: one.scripted_actions(), seed)
         found.append(int(run(env, lambda k, r=replay: r[k].expand(64, -1), 100)[1].sum()))
     assert max(found) <= 32
