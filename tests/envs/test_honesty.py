@@ -434,9 +434,10 @@ def test_starts_ask_for_feedback(name):
     assert int(success.sum()) >= 0.92 * 64
     one = make(name, 1, size=7)
     found = []
-    for seed in range(200, 206):
+    # The last pair succeeded from 39 starts of HitCloth and 41 of PushCube when goals were closer.
+    for seed, starts in [*((seed, 100) for seed in range(200, 206)), (20_002, 10_002)]:
         _, _, replay = run(one, lambda k: one.scripted_actions(), seed)
-        found.append(int(run(env, lambda k, r=replay: r[k].expand(64, -1), 100)[1].sum()))
+        found.append(int(run(env, lambda k, r=replay: r[k].expand(64, -1), starts)[1].sum()))
     assert max(found) <= 32
     zero, success, _ = run(env, lambda k: torch.zeros(64, actions), 100)
     assert int(success.sum()) <= 0.05 * 64
