@@ -24,7 +24,7 @@ _COLUMNS = {
         ("minutes", "minutes"),
     ],
 }
-_NAMES = {"moves": "APG, steps of actions"}  # of methods, if not in capitals
+_NAMES = {"moves": "APG, steps of actions", "plan": "plans"}  # of methods, if not in capitals
 
 
 @dataclass(frozen=True)
